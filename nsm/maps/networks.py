@@ -1,0 +1,170 @@
+"""Networks R² → Rⁿ that carry their Jacobian forward with the value."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nsm.maps.activations import Activation
+from nsm.maps.encodings import ENCODINGS
+
+
+def _push_linear(layer: nn.Linear, s: Tensor) -> Tensor:
+    """One matrix product for value and tangents; the bias belongs to the value alone."""
+    out = s @ layer.weight.T
+    return torch.cat([out[:1] + layer.bias, out[1:]])
+
+
+class PostActivationBlock(nn.Module):
+    """act(x + L₂ act(L₁ x)): the published residual block."""
+
+    def __init__(self, width: int, activation: Activation) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
+        self.activation = activation
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.activation(x + self.second(self.activation(self.first(x))))
+
+    def push(self, s: Tensor) -> Tensor:
+        inner = self.activation.push(_push_linear(self.first, s))
+        return self.activation.push(s + _push_linear(self.second, inner))
+
+
+class PreActivationBlock(nn.Module):
+    """x + L₂ act(L₁ act(x)), with L₂ zero at the start, so that the block begins as identity."""
+
+    def __init__(self, width: int, activation: Activation) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
+        self.activation = activation
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(self.activation(self.first(self.activation(x))))
+
+    def push(self, s: Tensor) -> Tensor:
+        inner = self.activation.push(_push_linear(self.first, self.activation.push(s)))
+        return s + _push_linear(self.second, inner)
+
+
+class DenseBlock(nn.Module):
+    """act(L x): one layer of a plain multi-layer perceptron."""
+
+    def __init__(self, width: int, activation: Activation) -> None:
+        super().__init__()
+        self.linear, self.activation = nn.Linear(width, width), activation
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.activation(self.linear(x))
+
+    def push(self, s: Tensor) -> Tensor:
+        return self.activation.push(_push_linear(self.linear, s))
+
+
+BLOCKS = {"plain": DenseBlock, "post": PostActivationBlock, "pre": PreActivationBlock}
+INITIALISATIONS = ("xavier", "kaiming", "siren")
+
+
+class NeuralMap(nn.Module):
+    """encoding → input layer → blocks → output layer, with value and Jacobian in one pass.
+
+    Args:
+        out_dim: 3 for a surface φ, 2 for a planar map h.
+        width, depth: features of the hidden layers; number of blocks.
+        block: ``plain`` (one layer each), ``post`` (published residual) or ``pre``.
+        activation: ``{"name": ..., parameters}``; see :mod:`nsm.maps.activations`.
+        encoding: ``{"name": ..., parameters}``; see :mod:`nsm.maps.encodings`.
+        initialisation: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
+    """
+
+    def __init__(
+        self,
+        out_dim: int = 3,
+        width: int = 256,
+        depth: int = 10,
+        block: str = "pre",
+        activation: dict[str, Any] | None = None,
+        encoding: dict[str, Any] | None = None,
+        initialisation: str = "kaiming",
+    ) -> None:
+        super().__init__()
+        activation = dict(activation or {"name": "softplus"})
+        encoding = dict(encoding or {"name": "identity"})
+        self.config: dict[str, Any] = {
+            "out_dim": out_dim,
+            "width": width,
+            "depth": depth,
+            "block": block,
+            "activation": dict(activation),
+            "encoding": dict(encoding),
+            "initialisation": initialisation,
+        }
+        if block not in BLOCKS:
+            raise ValueError(f"block {block!r} is not one of {', '.join(BLOCKS)}")
+        if initialisation not in INITIALISATIONS:
+            raise ValueError(
+                f"initialisation {initialisation!r} is not one of {', '.join(INITIALISATIONS)}"
+            )
+        name = encoding.pop("name")
+        if name not in ENCODINGS:
+            raise ValueError(f"encoding {name!r} is not one of {', '.join(ENCODINGS)}")
+        self.encoding = ENCODINGS[name](2, **encoding)
+        self.activation = Activation(**activation)
+        self.input = nn.Linear(self.encoding.out_dim, width)
+        self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
+        self.output = nn.Linear(width, out_dim)
+        self._initialise(initialisation)
+
+    def _initialise(self, how: str) -> None:
+        omega = float(self.activation.parameters_.get("omega", 1.0))
+        for module in self.modules():
+            if not isinstance(module, nn.Linear):
+                continue
+            if how == "xavier":
+                nn.init.xavier_normal_(module.weight)
+                nn.init.zeros_(module.bias)
+            elif how == "siren":
+                # Sitzmann et al., NeurIPS 2020: sin(ωz) keeps its distribution through the layers
+                fan_in = module.in_features
+                bound = 1 / fan_in if module is self.input else math.sqrt(6 / fan_in) / omega
+                nn.init.uniform_(module.weight, -bound, bound)
+        for block in self.blocks:
+            if isinstance(block, PreActivationBlock):
+                nn.init.zeros_(block.second.weight)
+                nn.init.zeros_(block.second.bias)
+
+    @property
+    def _opens_with_activation(self) -> bool:
+        # pre-activation blocks apply it themselves before their first layer, and need it at the end
+        return not (len(self.blocks) and isinstance(self.blocks[0], PreActivationBlock))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, 2) points of Ω to (N, out_dim)."""
+        y = self.input(self.encoding(x))
+        if self._opens_with_activation:
+            y = self.activation(y)
+        for block in self.blocks:
+            y = block(y)
+        if not self._opens_with_activation:
+            y = self.activation(y)
+        return self.output(y)
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
+        s = _push_linear(self.input, self.encoding.value_and_jacobian_stack(x))
+        if self._opens_with_activation:
+            s = self.activation.push(s)
+        for block in self.blocks:
+            s = block.push(s)
+        if not self._opens_with_activation:
+            s = self.activation.push(s)
+        s = _push_linear(self.output, s)
+        return s[0], s[1:].permute(1, 2, 0)
+
+
+def build_map(config: dict[str, Any]) -> NeuralMap:
+    """The network that a configuration (``NeuralMap.config``, or one from ``conf/map``) names."""
+    return NeuralMap(**config)

@@ -1,0 +1,225 @@
+"""Make a mesh a clean oriented manifold, or say in one line why that is not possible.
+
+Only repairs that cannot change the shape are made, and each is logged; anything that needs a
+decision (several parts, edges with three faces, one-sided surfaces) is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+from nsm.surfaces.loading import check_arrays
+
+# Loose parts below these shares of the area (each, and together) are debris or trimmings, such as
+# eyeballs behind a face, and are dropped; above, which part is meant is the user's to say.
+DROPPED_SHARE = 0.05
+DROPPED_TOTAL = 0.10
+DEGENERATE_AREA = 1e-14  # relative to the squared diagonal of the bounding box
+
+
+@dataclass(frozen=True)
+class CleanMesh:
+    """An oriented, connected manifold mesh.
+
+    vertices (V,3), faces (F,3), source_vertex (V,) index into the mesh as given; merged (W,) for
+    each given vertex its vertex here, or -1 if it is gone; log, one line per repair.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    source_vertex: np.ndarray
+    merged: np.ndarray
+    log: tuple[str, ...]
+
+
+def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanMesh:
+    """Repair what can be repaired without changing the shape; NsmError for the rest."""
+    vertices = np.asarray(vertices, dtype=np.float64)
+    faces = np.asarray(faces, dtype=np.int64)
+    check_arrays(vertices, faces, name)
+    log: list[str] = []
+    count = len(vertices)
+
+    source, representative = _merge_coincident(vertices, faces, log)
+    faces = _drop_bad_faces(vertices, representative[faces], name, log)
+    edges = topology.edges_of(faces)
+    if edges.count.max() > 2:
+        where = edges.pairs[int(edges.count.argmax())]
+        raise NsmError(
+            f"{name}: {int((edges.count > 2).sum())} non-manifold edges (more than two faces, "
+            f"e.g. at vertices {where[0]}-{where[1]}); remove inner faces in a mesh editor"
+        )
+    faces = _keep_main_part(vertices, faces, name, log)
+    faces = _orient(faces, name, log)
+
+    split_faces, old = topology.cut_along(
+        faces, np.zeros(len(topology.edges_of(faces).pairs), dtype=bool)
+    )
+    used = len(np.unique(faces))
+    if len(old) > used:
+        log.append(f"{len(old) - used} copies made of vertices where faces only touch at a point")
+        # parts that hung together only by such a point are separate now
+        split_faces = _keep_main_part(vertices[old], split_faces, name, log)
+        kept = np.unique(split_faces)
+        split_faces = np.searchsorted(kept, split_faces)
+        old = old[kept]
+    unreferenced = count - len(np.unique(source[np.isin(source, old)]))
+    if unreferenced and len(np.unique(representative)) == count:
+        log.append(f"{unreferenced} unreferenced vertices removed")
+    index = np.full(count, -1, dtype=np.int64)
+    index[old[::-1]] = np.arange(len(old))[::-1]  # the first copy wins
+    return CleanMesh(vertices[old], split_faces, old, index[representative], tuple(log))
+
+
+def _merge_coincident(
+    vertices: np.ndarray, faces: np.ndarray, log: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exactly coincident vertices become one, unless that would tie edges to three faces."""
+    keep = np.arange(len(vertices))
+    _, first, inverse = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+    representative = first[inverse.ravel()]
+    duplicates = len(vertices) - len(first)
+    if duplicates == 0:
+        return keep, keep
+    joined = representative[faces]
+    joined = joined[_distinct_corners(joined)]
+    joined = joined[_first_uses(joined)]
+    if len(joined) and topology.edges_of(joined).count.max() > 2 >= topology.edges_of(
+        faces[_distinct_corners(faces)]
+    ).count.max():
+        log.append(
+            f"{duplicates} coincident vertices left apart: joined, edges would have three faces"
+        )
+        return keep, keep
+    log.append(f"{duplicates} coincident vertices merged")
+    return keep, representative
+
+
+def _distinct_corners(faces: np.ndarray) -> np.ndarray:
+    a, b, c = faces.T
+    return (a != b) & (b != c) & (c != a)
+
+
+def _first_uses(faces: np.ndarray) -> np.ndarray:
+    """Mask of faces whose three vertices are not those of an earlier face."""
+    first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
+    mask = np.zeros(len(faces), dtype=bool)
+    mask[first] = True
+    return mask
+
+
+def _drop_bad_faces(
+    vertices: np.ndarray, faces: np.ndarray, name: str, log: list[str]
+) -> np.ndarray:
+    diagonal = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
+    distinct = _distinct_corners(faces)
+    area = topology.face_areas(vertices, faces)
+    flat = distinct & (area <= DEGENERATE_AREA * diagonal**2)
+    if (~distinct).any():
+        log.append(f"{int((~distinct).sum())} faces with a repeated vertex removed")
+    if flat.all() or not (distinct & ~flat).any():
+        raise NsmError(f"{name}: every face has zero area; give a mesh that is not collapsed")
+    faces = faces[distinct]
+    flat = flat[distinct]
+    if flat.any():
+        # taking a sliver out of the middle would tear a hole: only its removal by an edge flip
+        # keeps the surface closed
+        faces, flipped, removed = _remove_slivers(vertices, faces, flat)
+        if flipped:
+            log.append(f"{flipped} zero-area faces removed by edge flips")
+        if removed:
+            log.append(f"{removed} zero-area faces removed")
+    first = _first_uses(faces)
+    if not first.all():
+        log.append(f"{int((~first).sum())} duplicate faces removed")
+    return faces[first]
+
+
+def _remove_slivers(
+    vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray
+) -> tuple[np.ndarray, int, int]:
+    """Flip the longest edge of each zero-area face into its neighbour where that helps."""
+    faces = faces.copy()
+    flipped = 0
+    dropped = np.zeros(len(faces), dtype=bool)
+    for f in np.flatnonzero(flat):
+        a, b, c = faces[f]
+        sides = [(a, b, c), (b, c, a), (c, a, b)]
+        p, q, r = max(sides, key=lambda s: float(np.linalg.norm(vertices[s[0]] - vertices[s[1]])))
+        near = np.flatnonzero(((faces == p) | (faces == q)).sum(axis=1) == 2)
+        near = near[(near != f) & ~dropped[near]]
+        if len(near) == 1 and not flat[near[0]]:
+            g = int(near[0])
+            s = int(faces[g][(faces[g] != p) & (faces[g] != q)][0])
+            new_f, new_g = np.array([r, p, s]), np.array([r, s, q])
+            area = topology.face_areas(vertices, np.stack([new_f, new_g]))
+            exists = ((faces == r) | (faces == s)).sum(axis=1).max() == 2
+            if s != r and (area > 0).all() and not exists:
+                faces[f], faces[g] = new_f, new_g
+                flipped += 1
+                continue
+        dropped[f] = True
+    return faces[~dropped], flipped, int(dropped.sum())
+
+
+def _keep_main_part(
+    vertices: np.ndarray, faces: np.ndarray, name: str, log: list[str]
+) -> np.ndarray:
+    label = topology.face_components(faces)
+    count = int(label.max()) + 1
+    if count == 1:
+        return faces
+    share = np.bincount(label, weights=topology.face_areas(vertices, faces))
+    share = share / share.sum()
+    main = int(share.argmax())
+    others = np.delete(share, main)
+    if others.max() >= DROPPED_SHARE or others.sum() >= DROPPED_TOTAL:
+        listed = ", ".join(f"{100 * s:.1f} %" for s in np.sort(share)[::-1][:6])
+        raise NsmError(
+            f"{name}: {count} separate parts ({listed} of the area); "
+            "keep one of them, or join them, in a mesh editor"
+        )
+    log.append(
+        f"{count - 1} small separate parts dropped ({100 * others.sum():.2f} % of the area)"
+    )
+    return faces[label == main]
+
+
+def _orient(faces: np.ndarray, name: str, log: list[str]) -> np.ndarray:
+    """Turn faces so that neighbours agree; most faces keep their side."""
+    edges = topology.edges_of(faces)
+    pairs = topology.adjacent_faces(edges)
+    i, j = pairs // 3 @ [1, 0], pairs // 3 @ [0, 1]
+    disagree = faces.ravel()[pairs[:, 0]] == faces.ravel()[pairs[:, 1]]
+    if not disagree.any():
+        return faces
+    # A face and its mirror image are two nodes; agreeing neighbours join like with like. A part
+    # is one-sided exactly if some face ends up joined to its own mirror image.
+    n = len(faces)
+    a = np.concatenate([i, i + n])
+    b = np.concatenate([np.where(disagree, j + n, j), np.where(disagree, j, j + n)])
+    graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(2 * n, 2 * n)).tocsr()
+    label = connected_components(graph, directed=False)[1]
+    if (label[:n] == label[n:]).any():
+        raise NsmError(
+            f"{name}: one-sided (non-orientable) surface; cut it open in a mesh editor"
+        )
+    turned = np.zeros(n, dtype=bool)
+    done = np.zeros(n, dtype=bool)
+    while not done.all():
+        reached = breadth_first_order(
+            graph, int(np.argmin(done)), directed=False, return_predecessors=False
+        )
+        kept, mirrored = reached[reached < n], reached[reached >= n] - n
+        turned[mirrored if len(mirrored) <= len(kept) else kept] = True
+        done[reached % n] = True
+    faces = faces.copy()
+    faces[turned] = faces[turned][:, [0, 2, 1]]
+    log.append(f"{int(turned.sum())} faces turned round to agree with their neighbours")
+    return faces
