@@ -1,0 +1,36 @@
+"""Neural surface maps: surfaces as networks, and maps between them.
+
+>>> import nsm
+>>> surface = nsm.Surface.load("terrain")
+>>> phi = nsm.overfit(surface)
+>>> phi(uv)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nsm.api import load, overfit
+    from nsm.errors import NsmError
+    from nsm.results import NeuralSurface
+    from nsm.surfaces import Surface, catalogue_names
+
+__all__ = ["NeuralSurface", "NsmError", "Surface", "catalogue_names", "load", "overfit"]
+
+_HOME = {
+    "NeuralSurface": "nsm.results",
+    "NsmError": "nsm.errors",
+    "Surface": "nsm.surfaces",
+    "catalogue_names": "nsm.surfaces",
+    "load": "nsm.api",
+    "overfit": "nsm.api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # torch and Lightning take seconds to import: what needs neither should not wait for them
+    if name not in _HOME:
+        raise AttributeError(f"module 'nsm' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

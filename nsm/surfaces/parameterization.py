@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix, diags
-from scipy.sparse.linalg import splu
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
+from scipy.sparse.linalg import SuperLU, splu
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
@@ -133,9 +133,18 @@ def tutte(
     uv[loop] = boundary
     if len(inner):
         right = -laplacian[inner][:, loop] @ boundary
-        solver = splu(laplacian[inner][:, inner].tocsc(), permc_spec="MMD_AT_PLUS_A")
-        uv[inner] = solver.solve(right)
+        uv[inner] = _factorise(laplacian[inner][:, inner]).solve(right)
     return uv
+
+
+def _factorise(matrix: csr_matrix) -> SuperLU:
+    """LU of a positive definite matrix; pivots stay on the diagonal, or the fill would explode."""
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 def _mean_values(
@@ -326,10 +335,7 @@ def _proxy_step(
     # a whisper of damping: the disc may spin freely, which leaves the proxy singular
     reduced = reduced + diags(np.full(2 * k + m, 1e-9 * reduced.diagonal().mean()))
     try:
-        solver = splu(
-            reduced.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-        )
-        result = -solver.solve(freedom.T @ g)
+        result = -_factorise(reduced).solve(freedom.T @ g)
     except RuntimeError:
         return None
     return result if np.isfinite(result).all() else None

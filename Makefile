@@ -1,0 +1,34 @@
+# make demo: environment and a neural surface of real terrain; make test: environment and tests.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test check bench clean
+
+demo: .venv/.nsm
+	$(BIN)/nsm task=overfit surface=terrain
+
+test: check
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+check: .venv/.nsm-dev
+	$(BIN)/ruff check nsm tests benchmarks
+	$(BIN)/ruff format --check nsm tests benchmarks
+	$(BIN)/mypy
+
+# Error against time, default beside paper settings: about an hour. MESHES names the folder.
+bench: .venv/.nsm-dev
+	$(BIN)/python benchmarks/overfit.py $(if $(MESHES),--meshes $(MESHES))
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/.nsm: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+.venv/.nsm-dev: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,brain]'
+	touch $@ .venv/.nsm
+
+clean:
+	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,195 @@
+"""Where the configuration lies, what types it has, and how it is put together."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nsm.errors import NsmError
+
+
+@dataclass
+class TaskSchema:
+    name: str = MISSING
+
+
+@dataclass
+class SurfaceSchema:
+    path: str | None = None
+    name: str = MISSING
+    seam_vertices: list[int] | None = None
+    parameterization: str = MISSING
+    cache: bool = MISSING
+
+
+@dataclass
+class MapSchema:
+    width: int = MISSING
+    depth: int = MISSING
+    block: str = MISSING
+    initialisation: str = MISSING
+
+
+@dataclass
+class EnergySchema:
+    lambda_normal: float = MISSING
+
+
+@dataclass
+class DataSchema:
+    batch_size: int = MISSING
+    steps_per_epoch: int = MISSING
+    vertex_share: float = MISSING
+    pool: int | None = MISSING
+    held_out: int = MISSING
+
+
+@dataclass
+class TrainerSchema:
+    max_steps: int = MISSING
+    accelerator: str = MISSING
+    stop_gradient_norm: float | None = MISSING
+    stop_window: int = MISSING
+    threads: int | None = MISSING
+    progress: bool = MISSING
+
+
+@dataclass
+class LoggerSchema:
+    tensorboard: bool = MISSING
+    every: int = MISSING
+    pictures: int = MISSING
+
+
+@dataclass
+class Schema:
+    """The whole configuration. Groups whose keys depend on the choice are free dictionaries,
+    checked by what is built from them."""
+
+    task: TaskSchema = field(default_factory=TaskSchema)
+    surface: SurfaceSchema = field(default_factory=SurfaceSchema)
+    map: MapSchema = field(default_factory=MapSchema)
+    activation: dict[str, Any] = MISSING
+    encoding: dict[str, Any] = MISSING
+    energy: EnergySchema = field(default_factory=EnergySchema)
+    data: DataSchema = field(default_factory=DataSchema)
+    optimizer: dict[str, Any] = MISSING
+    scheduler: dict[str, Any] = MISSING
+    trainer: TrainerSchema = field(default_factory=TrainerSchema)
+    logger: LoggerSchema = field(default_factory=LoggerSchema)
+    domain: str = MISSING
+    seed: int = MISSING
+    resume: str | None = None
+
+
+_POSITIVE = (
+    "map.width",
+    "data.batch_size",
+    "data.steps_per_epoch",
+    "data.held_out",
+    "trainer.max_steps",
+    "trainer.stop_window",
+    "logger.every",
+)
+
+
+def conf_folder() -> Path:
+    """The configuration: inside an installed package, or beside it in a clone."""
+    package = Path(__file__).parent
+    installed = package / "conf"
+    return installed if installed.is_dir() else package.parent / "conf"
+
+
+def register_resolvers() -> None:
+    """Make ``nsm.run_folder`` known to the configuration files."""
+    OmegaConf.register_new_resolver("nsm.run_folder", _run_folder, replace=True, use_cache=True)
+
+
+def _run_folder(resume: str | None, task: str, name: str, path: str | None) -> str:
+    if resume is not None:
+        return str(resume)
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = f"outputs/{task}/{Path(path).stem if path else name}-{stamp}"
+    number, free = 2, folder
+    while Path(free).exists():  # runs started within the same second
+        number, free = number + 1, f"{folder}-{number}"
+    return free
+
+
+def compose_config(overrides: Sequence[str] = ()) -> DictConfig:
+    """The configuration with overrides as on the command line, checked.
+
+    Raises:
+        NsmError: an override that names no key or has the wrong type.
+    """
+    register_resolvers()
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+            return checked(compose("config", overrides=list(overrides)))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise NsmError(one_line(error)) from error
+
+
+def checked(config: DictConfig) -> DictConfig:
+    """The configuration with the types of :class:`Schema`, resolved.
+
+    Raises:
+        NsmError: a key that does not exist, a value of the wrong type or out of range.
+    """
+    try:
+        typed = OmegaConf.merge(OmegaConf.structured(Schema), config)
+        OmegaConf.resolve(typed)
+    except OmegaConfBaseException as error:
+        raise NsmError(f"setting {getattr(error, 'full_key', '')}: {one_line(error)}") from error
+    for key in _POSITIVE:
+        if OmegaConf.select(typed, key) < 1:
+            raise NsmError(f"setting {key}: {OmegaConf.select(typed, key)} is not at least 1")
+    if not 0 <= typed.data.vertex_share <= 1:
+        raise NsmError(f"setting data.vertex_share: {typed.data.vertex_share} is not in [0, 1]")
+    assert isinstance(typed, DictConfig)
+    return typed
+
+
+def one_line(error: BaseException) -> str:
+    """An error of the configuration libraries in one line, with the nearest valid name."""
+    text = str(error).strip()
+    first = text.splitlines()[0] if text else type(error).__name__
+    unknown = re.search(r"Could not override '([^']+)'", text)
+    if unknown:
+        key = unknown.group(1)
+        near = difflib.get_close_matches(key, known_keys(), n=1, cutoff=0.5)
+        hint = f"; did you mean '{near[0]}'?" if near else "; see nsm --help"
+        return f"no setting or group is called '{key}'{hint}"
+    option = re.search(r"Could not find '([^'/]+)/([^']+)'", text)
+    if option:
+        group, name = option.groups()
+        names = sorted(p.stem for p in (conf_folder() / group).glob("*.yaml"))
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+        hint = f"did you mean '{near[0]}'?" if near else f"choose one of {', '.join(names)}"
+        return f"{group}={name} does not exist; {hint}"
+    return first
+
+
+def known_keys() -> list[str]:
+    """Names of all groups and settings, dotted."""
+    groups = [p.name for p in conf_folder().iterdir() if p.is_dir()]
+    keys = list(groups)
+    for file in sorted(conf_folder().rglob("*.yaml")):
+        loaded = OmegaConf.load(file)
+        if not isinstance(loaded, DictConfig):
+            continue
+        prefix = f"{file.parent.name}." if file.parent != conf_folder() else ""
+        keys += [f"{prefix}{key}" for key in loaded if key not in ("defaults", "hydra")]
+    return sorted(set(keys))

@@ -1,0 +1,97 @@
+"""Training and held-out samples for overfitting one surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytorch_lightning as pl
+import torch
+from torch.utils.data import DataLoader, IterableDataset
+
+from nsm.data.sampling import Samples, SurfaceSampler
+from nsm.surfaces import Surface
+
+# Held-out points come from their own stream, whatever the training's seed.
+_HELD_OUT_SEED = 7_919
+
+
+class _Steps(IterableDataset[Samples]):
+    """One epoch: the batches of consecutive steps, each a function of (seed, step)."""
+
+    def __init__(
+        self, draw: Callable[[int], Samples], first_step: Callable[[], int], length: int
+    ) -> None:
+        self.draw, self.first_step, self.length = draw, first_step, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __iter__(self) -> Iterator[Samples]:
+        first = self.first_step()
+        for step in range(first, first + self.length):
+            yield self.draw(step)
+
+
+class OverfitData(pl.LightningDataModule):
+    """Samples of a surface, drawn on the trainer's device.
+
+    Args:
+        surface: the prepared surface.
+        batch_size: points a step.
+        steps_per_epoch: steps between two looks at the held-out points.
+        vertex_share: share of a batch that are mesh vertices, in [0, 1].
+        pool: None to draw afresh each step; a number for a fixed set of so many points (all
+            vertices among them), as published, from which the batches are picked.
+        held_out: points on which the error is followed; never trained on.
+        seed: of the training samples.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        *,
+        batch_size: int = 4096,
+        steps_per_epoch: int = 250,
+        vertex_share: float = 0.1,
+        pool: int | None = None,
+        held_out: int = 16_384,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.surface = surface
+        self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
+        self.vertex_share, self.pool_size = vertex_share, pool
+        self.held_out, self.seed = held_out, seed
+
+    def setup(self, stage: str | None = None) -> None:
+        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        self.sampler = SurfaceSampler(self.surface, device)
+        self.pool = (
+            self.sampler.pool(self.pool_size, self.sampler.generator(self.seed, -1))
+            if self.pool_size
+            else None
+        )
+
+    def batch(self, step: int) -> Samples:
+        """The training samples of a step."""
+        generator = self.sampler.generator(self.seed, step)
+        if self.pool is None:
+            return self.sampler.draw(self.batch_size, self.vertex_share, generator)
+        index = torch.randint(
+            len(self.pool.uv),
+            (self.batch_size,),
+            generator=generator,
+            device=self.sampler.device,
+        )
+        return Samples(*(part[index] for part in self.pool))
+
+    def train_dataloader(self) -> DataLoader[Samples]:
+        trainer = self.trainer
+        assert trainer is not None
+        steps = _Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
+        return DataLoader(steps, batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[Samples]:
+        samples = self.sampler.by_area(self.held_out, self.sampler.generator(_HELD_OUT_SEED))
+        chunks = [Samples(*parts) for parts in zip(*(p.split(8192) for p in samples), strict=True)]
+        return DataLoader(chunks, batch_size=None)  # type: ignore[arg-type]

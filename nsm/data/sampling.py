@@ -1,0 +1,89 @@
+"""Random points of a surface, drawn where the training happens."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nsm.surfaces import Surface
+
+
+class Samples(NamedTuple):
+    """Points of a surface: uv (N, 2) in Ω, points (N, 3), unit normals (N, 3)."""
+
+    uv: Tensor
+    points: Tensor
+    normals: Tensor
+
+
+class SurfaceSampler:
+    """Draws points of a surface on a device, uniformly by area on the mesh.
+
+    Args:
+        surface: the prepared surface.
+        device: where the samples are wanted.
+    """
+
+    def __init__(self, surface: Surface, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self.vertices = torch.as_tensor(surface.vertices, dtype=torch.float32, device=self.device)
+        self.uv = torch.as_tensor(surface.uv, dtype=torch.float32, device=self.device)
+        self.faces = torch.as_tensor(surface.faces, device=self.device)
+        a, b, c = self.vertices[self.faces].unbind(dim=1)
+        cross = torch.linalg.cross(b - a, c - a)
+        double_area = cross.norm(dim=1)
+        self.normals = cross / double_area.clamp_min(1e-30)[:, None]
+        # summed in float64: with a million faces a float32 sum would lose the small ones
+        cumulative = double_area.double().cumsum(0)
+        self.cumulative_area = cumulative / cumulative[-1]
+        weighted = torch.zeros_like(self.vertices)
+        weighted.index_add_(0, self.faces.reshape(-1), cross.repeat_interleave(3, dim=0))
+        self.vertex_normals = weighted / weighted.norm(dim=1, keepdim=True).clamp_min(1e-30)
+
+    def generator(self, seed: int, step: int = 0) -> torch.Generator:
+        """The source of randomness of one step: samples depend on (seed, step) and nothing else,
+        which is what lets interrupted work resume to the same result."""
+        generator = torch.Generator(device=self.device)
+        generator.manual_seed((seed * 1_000_003 + step) % (2**63))
+        return generator
+
+    def by_area(self, count: int, generator: torch.Generator) -> Samples:
+        """``count`` points, uniform by area of the mesh."""
+        dice = torch.rand(count, generator=generator, device=self.device, dtype=torch.float64)
+        face = torch.searchsorted(self.cumulative_area, dice).clamp(max=len(self.faces) - 1)
+        r = torch.rand(count, 2, generator=generator, device=self.device)
+        root = r[:, 0].sqrt()
+        weights = torch.stack([1 - root, root * (1 - r[:, 1]), root * r[:, 1]], dim=1)
+        corners = self.faces[face]
+        return Samples(
+            uv=(weights[:, :, None] * self.uv[corners]).sum(dim=1),
+            points=(weights[:, :, None] * self.vertices[corners]).sum(dim=1),
+            normals=self.normals[face],
+        )
+
+    def at_vertices(self, index: Tensor) -> Samples:
+        """Samples at the given vertices (N,), with area-weighted vertex normals."""
+        return Samples(self.uv[index], self.vertices[index], self.vertex_normals[index])
+
+    def draw(self, count: int, vertex_share: float, generator: torch.Generator) -> Samples:
+        """``count`` points: a share of random vertices, the rest by area."""
+        at_vertices = round(count * vertex_share)
+        samples = self.by_area(count - at_vertices, generator)
+        if at_vertices == 0:
+            return samples
+        index = torch.randint(
+            len(self.vertices), (at_vertices,), generator=generator, device=self.device
+        )
+        return _join(samples, self.at_vertices(index))
+
+    def pool(self, count: int, generator: torch.Generator) -> Samples:
+        """A fixed set: all vertices and, by area, what is missing to ``count``."""
+        everywhere = torch.arange(len(self.vertices), device=self.device)
+        rest = self.by_area(max(count - len(everywhere), 0), generator)
+        return _join(rest, self.at_vertices(everywhere))
+
+
+def _join(a: Samples, b: Samples) -> Samples:
+    return Samples(*(torch.cat(pair) for pair in zip(a, b, strict=True)))

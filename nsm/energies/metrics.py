@@ -1,0 +1,110 @@
+"""Metrics of Ω, and the two numbers that every distortion of a map between surfaces needs.
+
+With A the metric that the source surface induces on Ω and B the target's, the differential J_f
+of the map satisfies J_fᵀJ_f ~ A⁻¹B (similar matrices), so trace and determinant of A⁻¹B tell
+both singular values, and no tangent frame is needed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nsm.energies.numerics import safe_sqrt, widen
+
+# Added to A's diagonal: a source metric this small is a collapsed surface (areas are about π),
+# and larger ones, from 1e-6 up, are altered by less than 1e-6 of themselves.
+SOURCE_FLOOR = 1e-12
+
+
+class Invariants(NamedTuple):
+    """Trace t = σ₁² + σ₂² and determinant d = σ₁²σ₂² of M = A⁻¹B; each (...), float64."""
+
+    trace: Tensor
+    determinant: Tensor
+
+    def shifted(self, epsilon: float) -> Invariants:
+        """The invariants of M + ``epsilon`` I."""
+        t, d = self
+        return Invariants(t + 2 * epsilon, d + epsilon * t + epsilon**2)
+
+
+def first_fundamental_form(jacobian: Tensor) -> Tensor:
+    """JᵀJ, the metric that a map induces on Ω.
+
+    Args:
+        jacobian: (..., 3, 2) of a surface or (..., 2, 2) of a planar map; entries below 1e18 in
+            float32. Squaring doubles the digits that a slender Jacobian loses: where σ₁/σ₂
+            passes 1e3, give it in float64.
+
+    Returns:
+        (..., 2, 2), symmetric positive semidefinite, of the type of ``jacobian``.
+
+    Raises:
+        ValueError: the last axis does not hold two columns.
+    """
+    if jacobian.ndim < 2 or jacobian.shape[-1] != 2:
+        raise ValueError(f"a Jacobian is (..., n, 2), not {tuple(jacobian.shape)}")
+    return jacobian.transpose(-1, -2) @ jacobian
+
+
+def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
+    """Trace and determinant of A⁻¹B.
+
+    Finite in value and gradient for all finite A and B of float32 range. A gains
+    ``SOURCE_FLOOR`` on its diagonal, and det A is held above ε·(tr A)², ε the machine epsilon of
+    the type in which A came: a smaller determinant is rounding noise. Only the symmetric parts
+    of A and B are read.
+
+    Args:
+        source: A (..., 2, 2), positive semidefinite.
+        target: B (..., 2, 2), positive semidefinite.
+
+    Returns:
+        ``Invariants`` in float64, both at least zero.
+
+    Raises:
+        ValueError: a metric is not (..., 2, 2).
+    """
+    for metric in (source, target):
+        if metric.shape[-2:] != (2, 2):
+            raise ValueError(f"a metric is (..., 2, 2), not {tuple(metric.shape)}")
+    a, b, c = _entries(source)
+    e, f, g = _entries(target)
+    a, c = a + SOURCE_FLOOR, c + SOURCE_FLOOR
+    trace_a = (a + c).clamp(min=2 * SOURCE_FLOOR)
+    det_a = torch.maximum(a * c - b * b, torch.finfo(source.dtype).eps * trace_a**2)
+    trace = (c * e - 2 * b * f + a * g) / det_a
+    determinant = (e * g - f * f) / det_a
+    return Invariants(trace.clamp(min=0), determinant.clamp(min=0))
+
+
+def _entries(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    m = widen(metric)
+    return m[..., 0, 0], (m[..., 0, 1] + m[..., 1, 0]) / 2, m[..., 1, 1]
+
+
+def singular_values(trace: Tensor, determinant: Tensor) -> tuple[Tensor, Tensor]:
+    """σ₁ ≥ σ₂ ≥ 0 from t = σ₁² + σ₂² and d = σ₁²σ₂².
+
+    At σ₁ = σ₂ and at zero the singular values have no derivative; there the gradient is finite
+    (that of the mean of the two, and zero). d is taken as at most t²/4.
+
+    Args:
+        trace, determinant: t and d (...), not negative; float64, as ``Invariants`` holds them,
+            or σ₁ − σ₂ of a near-conformal map drowns in rounding.
+
+    Returns:
+        σ₁ and σ₂, each (...).
+    """
+    product = torch.minimum(safe_sqrt(determinant, 1e-60), trace / 2)
+    total = safe_sqrt(trace + 2 * product, 1e-60)
+    # at σ₁ = σ₂ the squared difference is rounding of the trace, and its root has no slope
+    gap = (trace - 2 * product) / torch.where(trace > 0, trace, 1.0)
+    difference = safe_sqrt(gap, 1e-15) * safe_sqrt(trace, 1e-60)
+    largest = (total + difference) / 2
+    # not (total − difference) / 2, which cancels where σ₂ is much the smaller
+    smallest = product / torch.where(largest > 0, largest, 1.0)
+    return largest, torch.minimum(smallest, largest)

@@ -1,0 +1,110 @@
+"""What accompanies a training: checkpoints, the stopping rule, pictures over time."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from pytorch_lightning.callbacks import Callback
+from torch.optim import Optimizer
+
+from nsm.errors import NsmError
+from nsm.results.pictures import reconstruction_image
+from nsm.surfaces import Surface
+
+
+class AtomicCheckpoint(Callback):
+    """Keep the last state of the training after each epoch, whole at any moment.
+
+    Args:
+        path: the checkpoint file; written beside it first, then moved into its place.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        temporary = self.path.with_suffix(".tmp")
+        trainer.save_checkpoint(temporary)
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        os.replace(temporary, self.path)
+
+
+class GradientWatch(Callback):
+    """Log the gradient's norm, stop by it, and refuse to go on from a loss that is not a number.
+
+    Args:
+        every: steps between two values in the log.
+        stop_norm: stop when the mean norm of the last ``window`` steps is below; None: never.
+        window: how many steps are averaged.
+    """
+
+    def __init__(self, every: int, stop_norm: float | None, window: int) -> None:
+        self.every, self.stop_norm = every, stop_norm
+        self.recent: deque[float] = deque(maxlen=window)
+
+    def on_before_optimizer_step(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer
+    ) -> None:
+        logging = trainer.global_step % self.every == 0
+        if not logging and self.stop_norm is None:
+            return
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        norm = float(torch.nn.utils.get_total_norm(gradients))
+        if norm != norm:
+            raise NsmError(
+                f"the loss is not a number at step {trainer.global_step}; "
+                "lower optimizer.lr, or resume from the last checkpoint"
+            )
+        self.recent.append(norm)
+        if logging:
+            pl_module.log("train/gradient_norm", norm)
+
+    def on_train_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        full = len(self.recent) == self.recent.maxlen
+        if self.stop_norm is not None and full:
+            if sum(self.recent) / len(self.recent) < self.stop_norm:
+                trainer.should_stop = True
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"recent": list(self.recent)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.recent.extend(state_dict["recent"])
+
+
+class Pictures(Callback):
+    """Put pictures of the surface into TensorBoard, evenly spread over the run.
+
+    Args:
+        surface: what is being learned.
+        count: how many pictures in all.
+    """
+
+    def __init__(self, surface: Surface, count: int) -> None:
+        self.surface, self.count, self.taken = surface, count, 0
+
+    def on_validation_epoch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule
+    ) -> None:
+        share = trainer.global_step / max(1, trainer.max_steps)
+        due = int(share * self.count)
+        if due <= self.taken or trainer.logger is None:
+            return
+        self.taken = due
+        image = reconstruction_image(self.surface, pl_module.map, size=384)
+        trainer.logger.experiment.add_image(
+            "surface", image, trainer.global_step, dataformats="HWC"
+        )

@@ -1,0 +1,101 @@
+"""A progress bar with time left, loss and current error; plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytorch_lightning as pl
+from pytorch_lightning.callbacks import Callback
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+# seconds between two lines in a log file, and between two updates of the bar
+_LINE_EVERY = 10.0
+_BAR_EVERY = 0.2
+
+
+class TrainingProgress(Callback):
+    """Show how far the training is.
+
+    Args:
+        console: where to write.
+        title: what is being trained.
+        error_key: the logged figure that is shown as the current error, in percent.
+    """
+
+    def __init__(self, console: Console, title: str, error_key: str = "val/rms_percent") -> None:
+        self.console, self.title, self.error_key = console, title, error_key
+        self.bar: Progress | None = None
+        self.task: TaskID | None = None
+        self.started = self.shown = 0.0
+        self.first_step = 0
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.started = time.monotonic()
+        self.first_step = trainer.global_step
+        if not self.console.is_terminal:
+            return
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[figures]}"),
+            console=self.console,
+        )
+        self.bar.start()
+        self.task = self.bar.add_task(
+            self.title, total=trainer.max_steps, completed=trainer.global_step, figures=""
+        )
+
+    def on_train_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        now = time.monotonic()
+        if now - self.shown < (_BAR_EVERY if self.bar else _LINE_EVERY):
+            return
+        self.shown = now
+        figures = f"loss {float(outputs['loss']):.2e}"
+        error = trainer.callback_metrics.get(self.error_key)
+        if error is not None:
+            figures += f"  error {float(error):.3f} %"
+        step = trainer.global_step
+        if self.bar is not None and self.task is not None:
+            self.bar.update(self.task, completed=step, figures=figures)
+            return
+        seconds = (now - self.started) / max(1, step - self.first_step)
+        left = seconds * (trainer.max_steps - step)
+        self.console.print(
+            f"{self.title}  step {step}/{trainer.max_steps}  left {left:.0f} s  {figures}"
+        )
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if self.bar is not None and self.task is not None:
+            self.bar.update(self.task, completed=trainer.global_step)
+        self._stop()
+
+    def on_exception(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
+    ) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+            self.bar = None

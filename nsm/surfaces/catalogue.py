@@ -1,0 +1,162 @@
+"""Meshes known by name: fetched from public addresses, shipped in packages, or computed."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from nsm.errors import NsmError
+from nsm.surfaces import bundled, shapes
+from nsm.surfaces.cache import cache_folder
+from nsm.surfaces.loading import load_mesh
+
+TIMEOUT_SECONDS = 30
+_CLASSIC = "https://raw.githubusercontent.com/alecjacobson/common-3d-test-models/master/data"
+_ANIMALS = (
+    "https://raw.githubusercontent.com/patr-schm/surface-maps-via-adaptive-triangulations/"
+    "a1bf1ebae522a8f2ec5c0603420b7cd99db354fe/data/meshes"
+)
+
+
+@dataclass(frozen=True)
+class _Remote:
+    """A file at a public address; file is its name in the cache and on a mirror."""
+
+    file: str
+    url: str
+    sha256: str
+    description: str
+
+
+_REMOTE = {
+    "bunny": _Remote(
+        "stanford-bunny.obj",
+        f"{_CLASSIC}/stanford-bunny.obj",
+        "1eb35d1e21ce99e5ce911353b6be278990713448dd9e8f5c9387f9de39b32205",
+        "Stanford bunny, 35947 vertices, five holes below (fetched)",
+    ),
+    "cow": _Remote(
+        "cow.obj",
+        f"{_CLASSIC}/cow.obj",
+        "69afce548640bc2beb0c44894d1a24d5766cc9cd3fd74f3ec55b4e229104b23f",
+        "Cow, 2903 vertices, closed (fetched)",
+    ),
+    "homer": _Remote(
+        "homer.obj",
+        f"{_CLASSIC}/homer.obj",
+        "b20b1391fd62964f65703d748514d86d747d1202d38e55e0f1addac7a5a10e8b",
+        "Homer Simpson, 6002 vertices, closed (fetched)",
+    ),
+    "igea": _Remote(
+        "igea.ply",
+        f"{_CLASSIC}/igea.ply",
+        "75f065f8fefbb468363718a5df39cc73c89e97c2ce3fa8a3b0086a08bb466222",
+        "Igea, a scanned head, 134345 vertices, closed (fetched)",
+    ),
+    "suzanne": _Remote(
+        "suzanne.obj",
+        f"{_CLASSIC}/suzanne.obj",
+        "d8684326f9bd8cfc24d3d302c1042fa16f63d2e66e49ed56b413fa20bed271e6",
+        "Blender's monkey head, 507 vertices, open at the eyes (fetched)",
+    ),
+    "shrec07-381": _Remote(
+        "shrec07-381.off",
+        f"{_ANIMALS}/shrec/381.off",
+        "8730bb6df17500293bf9c860ff417b942470124017dda79e01ddb070cdee6451",
+        "SHREC 2007 four-legged animal 381, 6938 vertices, closed (fetched)",
+    ),
+    "shrec07-384": _Remote(
+        "shrec07-384.off",
+        f"{_ANIMALS}/shrec/384.off",
+        "920118c3276bb989c84a3d82179978cdc333fdc05d3d4bd1a931d5e02adbb761",
+        "SHREC 2007 four-legged animal 384, 4712 vertices, closed (fetched)",
+    ),
+    "shrec07-388": _Remote(
+        "shrec07-388.off",
+        f"{_ANIMALS}/shrec/388.off",
+        "682defed90d1c823cb9d0e5b19347a0e6d6315b44549579fa2ee2a2036fb7fcd",
+        "SHREC 2007 four-legged animal 388, 8411 vertices, closed (fetched)",
+    ),
+    "shrec07-393": _Remote(
+        "shrec07-393.off",
+        f"{_ANIMALS}/shrec/393.off",
+        "d29b9248ee7be464d20ebee0101369ddcea6006332fd5cb2f5ee3af5ee49f80c",
+        "SHREC 2007 four-legged animal 393, 9757 vertices, closed (fetched)",
+    ),
+}
+
+_LOCAL: dict[str, tuple[Callable[[], shapes.Mesh], str]] = {
+    "terrain": (bundled.terrain, "Jacksboro fault elevation model, 15525 vertices, in metres"),
+    "brain": (bundled.brain, "fsaverage5 left pial surface, 10242 vertices (nsm[brain])"),
+    "nut": (partial(bundled.pyvista_example, "nut"), "pyvista's hexagonal nut (nsm[view])"),
+    "plane": (shapes.plane, "square [-1,1]^2, flat, 2025 vertices"),
+    "hemisphere": (shapes.hemisphere, "upper half of the unit sphere, 1801 vertices"),
+    "sphere": (shapes.sphere, "unit sphere, subdivided icosahedron, 2562 vertices"),
+    "torus": (shapes.torus, "torus of radii 1 and 0.4, 2048 vertices"),
+    "cylinder": (shapes.cylinder, "tube of radius 1 and height 2, open ends, 1984 vertices"),
+    "cone": (shapes.cone, "cone of radius 1 and height 1.5, open base, 1801 vertices"),
+    "saddle": (shapes.saddle, "z = (x^2 - y^2) / 2 over [-1,1]^2, 2025 vertices"),
+}
+
+
+def catalogue_names() -> dict[str, str]:
+    """Every name with a line on what the mesh is, in alphabetical order."""
+    lines = {name: remote.description for name, remote in _REMOTE.items()}
+    lines.update({name: description for name, (_, description) in _LOCAL.items()})
+    return dict(sorted(lines.items()))
+
+
+def catalogue_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V,3) float64 and triangles (F,3) int64 of a mesh of the catalogue, unrepaired.
+
+    A fetched mesh is kept in the cache folder and checked against its sha256; the environment
+    variable NSM_MESH_URL names a mirror, a folder that holds the files under their own names.
+    NsmError for an unknown name, a missing optional package, or a failed or wrong download.
+    """
+    if name in _LOCAL:
+        return _LOCAL[name][0]()
+    if name in _REMOTE:
+        return _fetch(name, _REMOTE[name])
+    near = difflib.get_close_matches(name, catalogue_names(), n=1, cutoff=0.0)
+    raise NsmError(
+        f"'{name}' is not in the catalogue; did you mean '{near[0]}'? "
+        "For a mesh of your own use surface.path=FILE"
+    )
+
+
+def _fetch(name: str, remote: _Remote) -> tuple[np.ndarray, np.ndarray]:
+    import pooch
+
+    mirror = os.environ.get("NSM_MESH_URL")
+    url = f"{mirror.rstrip('/')}/{remote.file}" if mirror else remote.url
+    try:
+        file = pooch.retrieve(
+            url,
+            known_hash=f"sha256:{remote.sha256}",
+            fname=remote.file,
+            path=cache_folder() / "meshes",
+            downloader=pooch.HTTPDownloader(timeout=TIMEOUT_SECONDS),
+        )
+    except PermissionError as error:
+        raise NsmError(
+            f"{name}: cannot write to {error.filename or cache_folder()}; set NSM_CACHE to a "
+            "folder that can be written"
+        ) from error
+    except OSError as error:  # requests' errors are OSErrors: no network, no such file, timeout
+        raise NsmError(
+            f"{name}: cannot fetch {url} ({type(error).__name__}); without a network use "
+            "surface=terrain or surface.path=FILE, or set NSM_MESH_URL to a mirror"
+        ) from error
+    except ValueError as error:  # pooch's word for another checksum, and for an unusable address
+        reason = "its checksum is wrong" if "hash" in str(error) else "not a usable address"
+        raise NsmError(
+            f"{name}: {url} is not the expected file ({reason}); check NSM_MESH_URL, or use "
+            "surface=terrain or surface.path=FILE"
+        ) from error
+    vertices, faces, _ = load_mesh(file)
+    return vertices, faces

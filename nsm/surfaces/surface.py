@@ -1,0 +1,264 @@
+"""The prepared surface: a disc-shaped mesh with injective coordinates in a planar domain."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nsm.errors import NsmError
+from nsm.surfaces import cache as cache_
+from nsm.surfaces import topology
+from nsm.surfaces.catalogue import catalogue_mesh
+from nsm.surfaces.cutting import cut_to_disc
+from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.parameterization import (
+    DOMAIN_AREA,
+    DOMAINS,
+    METHODS,
+    boundary_self_intersections,
+    flipped_triangles,
+    parameterize,
+    symmetric_dirichlet_per_face,
+)
+from nsm.surfaces.validation import clean
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh cut to a disc, normalised, and parameterised injectively into Ω.
+
+    Attributes:
+        name: what it is called in logs and file names.
+        vertices: (V, 3) float64, centred, scaled so that the area is that of Ω (π or 4).
+        faces: (F, 3) int64, counter-clockwise in Ω.
+        uv: (V, 2) float64 in Ω, without flipped triangles.
+        domain: ``disc`` (unit disc) or ``square`` ([-1, 1]²).
+        source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
+        twins: (T, 2) int64, pairs of vertices on the seam that were one point.
+        scale, center: ``vertices = (original - center) * scale``.
+        quality: figures of the preparation (see :meth:`from_arrays`).
+        log: what was repaired, converted or cut, a line each.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    domain: str
+    source_vertex: np.ndarray
+    twins: np.ndarray
+    scale: float
+    center: np.ndarray
+    quality: dict[str, float] = field(default_factory=dict)
+    log: tuple[str, ...] = ()
+
+    @classmethod
+    def load(
+        cls,
+        path_or_name: str | Path,
+        *,
+        domain: str = "disc",
+        seam_vertices: Sequence[int] | None = None,
+        parameterization: str = "slim",
+        cache: bool = True,
+    ) -> Surface:
+        """Load a mesh file, or a mesh of the catalogue by name, and prepare it.
+
+        Args:
+            path_or_name: an OBJ, PLY, OFF, STL, GLTF or GLB file, or a catalogue name.
+            domain: ``disc`` or ``square``.
+            seam_vertices: vertices (numbers in the file) that the seam of the cut passes through;
+                without them, mutually far points are chosen where a seam is needed.
+            parameterization: ``slim`` or ``tutte``.
+            cache: keep the prepared surface on disk, keyed by content.
+
+        Raises:
+            NsmError: no such file or name, or a mesh that cannot be prepared.
+        """
+        text = str(path_or_name)
+        if Path(text).suffix or "/" in text or "\\" in text or Path(text).exists():
+            vertices, faces, log = load_mesh(path_or_name)
+            name = Path(text).stem
+        else:
+            vertices, faces = catalogue_mesh(text)
+            name, log = text, ()
+        return cls.from_arrays(
+            vertices,
+            faces,
+            name=name,
+            domain=domain,
+            seam_vertices=seam_vertices,
+            parameterization=parameterization,
+            cache=cache,
+            log=log,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        name: str = "mesh",
+        domain: str = "disc",
+        seam_vertices: Sequence[int] | None = None,
+        parameterization: str = "slim",
+        cache: bool = False,
+        log: Sequence[str] = (),
+    ) -> Surface:
+        """Validate, cut, normalise and parameterise a mesh (V, 3), (F, 3).
+
+        ``quality`` holds flipped_triangles, boundary_self_intersections (both 0, or this raises),
+        median_symmetric_dirichlet and tutte_median_symmetric_dirichlet (of the map from Ω to the
+        mesh), seam_vertices (how many doubled vertices) and seconds.
+
+        Raises:
+            NsmError: the mesh cannot be repaired, cut or flattened without flips.
+        """
+        if domain not in DOMAINS:
+            raise NsmError(f"{name}: unknown domain '{domain}'; use one of {', '.join(DOMAINS)}")
+        if parameterization not in METHODS:
+            raise NsmError(
+                f"{name}: unknown parameterization '{parameterization}'; "
+                f"use one of {', '.join(METHODS)}"
+            )
+        seam = None if seam_vertices is None else [int(v) for v in seam_vertices]
+        options = {"domain": domain, "seam": seam, "method": parameterization}
+        key = cache_.preparation_key(vertices, faces, options) if cache else ""
+        stored = cache_.read(key) if cache else None
+        if stored is not None:
+            return cls._from_stored(name, domain, stored)
+        surface = cls._prepare(vertices, faces, name, domain, seam, parameterization, log)
+        if cache:
+            cache_.write(key, surface._to_stored())
+        return surface
+
+    @classmethod
+    def _prepare(
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        name: str,
+        domain: str,
+        seam: list[int] | None,
+        method: str,
+        log: Sequence[str],
+    ) -> Surface:
+        start = time.perf_counter()
+        mesh = clean(vertices, faces, name)
+        if seam is not None:
+            for v in seam:
+                if not 0 <= v < len(mesh.merged) or mesh.merged[v] < 0:
+                    raise NsmError(
+                        f"{name}: seam vertex {v} is not on the mesh "
+                        f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices"
+                    )
+            seam = [int(mesh.merged[v]) for v in seam]
+        cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
+        center = 0.5 * (cut.vertices.min(axis=0) + cut.vertices.max(axis=0))
+        centred = cut.vertices - center
+        area = float(topology.face_areas(centred, cut.faces).sum())
+        scale = float(np.sqrt(DOMAIN_AREA[domain] / area))
+        normalised = centred * scale
+        flat = parameterize(normalised, cut.faces, domain=domain, method=method, name=name)
+        flipped = flipped_triangles(flat.uv, cut.faces)
+        crossings = boundary_self_intersections(flat.uv, cut.loop)
+        if flipped or crossings:
+            raise NsmError(
+                f"{name}: the parameterisation is not injective ({flipped} flipped triangles, "
+                f"{crossings} boundary crossings); give seam_vertices at the tips of long parts"
+            )
+        source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
+        quality = {
+            "flipped_triangles": float(flipped),
+            "boundary_self_intersections": float(crossings),
+            "median_symmetric_dirichlet": _median_distortion(normalised, cut.faces, flat.uv),
+            "tutte_median_symmetric_dirichlet": _median_distortion(
+                normalised, cut.faces, flat.tutte
+            ),
+            "seam_vertices": float(len(cut.twins)),
+            "seconds": time.perf_counter() - start,
+        }
+        return cls(
+            name=name,
+            vertices=normalised,
+            faces=cut.faces,
+            uv=flat.uv,
+            domain=domain,
+            source_vertex=source,
+            twins=cut.twins,
+            scale=scale,
+            center=center,
+            quality=quality,
+            log=(*log, *mesh.log, *cut.log, *flat.log),
+        )
+
+    def _to_stored(self) -> dict[str, np.ndarray]:
+        words = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
+        return {
+            "vertices": self.vertices,
+            "faces": self.faces,
+            "uv": self.uv,
+            "source_vertex": self.source_vertex,
+            "twins": self.twins,
+            "center": self.center,
+            "words": np.frombuffer(words.encode(), dtype=np.uint8),
+        }
+
+    @classmethod
+    def _from_stored(cls, name: str, domain: str, stored: dict[str, np.ndarray]) -> Surface:
+        words: dict[str, Any] = json.loads(stored["words"].tobytes())
+        return cls(
+            name=name,
+            vertices=stored["vertices"],
+            faces=stored["faces"],
+            uv=stored["uv"],
+            domain=domain,
+            source_vertex=stored["source_vertex"],
+            twins=stored["twins"],
+            scale=words["scale"],
+            center=stored["center"],
+            quality=words["quality"],
+            log=(*words["log"], "prepared surface taken from the cache"),
+        )
+
+    @property
+    def bounding_box_diagonal(self) -> float:
+        """Length of the bounding box's diagonal, in normalised units."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    def content_key(self) -> str:
+        """Hash of the geometry and its parameterisation: equal surfaces, equal keys."""
+        digest = hashlib.sha256(self.domain.encode())
+        for array in (self.vertices, self.uv):
+            digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        digest.update(np.ascontiguousarray(self.faces, dtype="<i8").tobytes())
+        return digest.hexdigest()[:32]
+
+    def preimages(self, vertex_ids: Sequence[int]) -> np.ndarray:
+        """Points (L, 2) of Ω of vertices of the mesh file; of a seam vertex, its first copy.
+
+        Raises:
+            NsmError: a vertex that the file does not have, or that was removed as bad.
+        """
+        result = np.empty((len(vertex_ids), 2))
+        for row, vertex in enumerate(vertex_ids):
+            found = np.flatnonzero(self.source_vertex == int(vertex))
+            if int(vertex) < 0 or len(found) == 0:
+                raise NsmError(
+                    f"{self.name}: vertex {vertex} is not on the surface "
+                    f"(0 to {int(self.source_vertex.max())}); give another landmark"
+                )
+            result[row] = self.uv[found[0]]
+        return result
+
+
+def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:
+    return float(np.median(symmetric_dirichlet_per_face(vertices, faces, uv)))

@@ -1,0 +1,82 @@
+"""Optimisers and learning-rate schedules by name, from plain settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
+
+OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
+    "adam": torch.optim.Adam,
+    "adamw": torch.optim.AdamW,
+    "rmsprop": torch.optim.RMSprop,
+    "sgd": torch.optim.SGD,
+}
+SCHEDULERS = ("constant", "cosine", "sgdr")
+
+
+def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
+    """The optimiser that settings name.
+
+    Args:
+        module: whose parameters are trained; those of a ``tables`` list (feature grids, each
+            entry of which sees few samples a step) take ``encoding_lr`` where that is given.
+        settings: ``name``, ``lr``, ``encoding_lr`` (or None) and the optimiser's own parameters.
+
+    Raises:
+        ValueError: the optimiser is not known or does not take a parameter.
+    """
+    rest = dict(settings)
+    name, encoding_lr = rest.pop("name"), rest.pop("encoding_lr", None)
+    if name not in OPTIMIZERS:
+        raise ValueError(f"optimizer {name!r} is not one of {', '.join(OPTIMIZERS)}")
+    named = [(key, p) for key, p in module.named_parameters() if p.requires_grad]
+    grids = [p for key, p in named if ".tables." in key]
+    others = [p for key, p in named if ".tables." not in key]
+    groups: list[dict[str, Any]] = [{"params": others}]
+    if grids:
+        groups.append({"params": grids, "lr": encoding_lr or rest["lr"]})
+    try:
+        return OPTIMIZERS[name](groups, **rest)
+    except TypeError as error:
+        raise ValueError(f"optimizer {name!r}: {error}") from error
+
+
+def build_scheduler(
+    optimizer: Optimizer, settings: dict[str, Any], max_steps: int
+) -> LRScheduler:
+    """A schedule stepped after each training step.
+
+    ``constant``; ``cosine``: one half-wave down to ``final`` of the rate at ``max_steps``;
+    ``sgdr``: warm restarts every ``period`` steps, each ``period_factor`` times the one before
+    (Loshchilov and Hutter, ICLR 2017). All rise linearly over the first ``warmup`` steps.
+
+    Raises:
+        ValueError: the schedule is not known.
+    """
+    name, warmup = settings["name"], settings.get("warmup", 0)
+    final = settings.get("final", 0.0)
+    if name not in SCHEDULERS:
+        raise ValueError(f"scheduler {name!r} is not one of {', '.join(SCHEDULERS)}")
+
+    def wave(share: float) -> float:
+        return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * share))
+
+    def factor(step: int) -> float:
+        rise = min(1.0, (step + 1) / (warmup + 1))
+        if name == "constant":
+            return rise
+        if name == "cosine":
+            return rise * wave(min(1.0, step / max(1, max_steps)))
+        start, period = 0.0, float(settings["period"])
+        while step >= start + period:
+            start += period
+            period *= settings.get("period_factor", 1.0)
+        return rise * wave((step - start) / period)
+
+    return LambdaLR(optimizer, factor)

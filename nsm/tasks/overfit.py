@@ -1,0 +1,82 @@
+"""Overfit: a network φ: Ω → R³ is trained to be the surface (METHOD, Eq. 1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+
+from nsm.data import Samples
+from nsm.energies.overfit import normal, position
+from nsm.maps import build_map
+from nsm.tasks.optimizers import build_optimizer, build_scheduler
+
+
+class Overfit(pl.LightningModule):
+    """L = mean ‖f − φ‖² + λ_n mean ‖n_φ − n_f‖² over samples of the surface.
+
+    Args:
+        map: configuration of the network (see :class:`nsm.maps.NeuralMap`).
+        optimizer, scheduler: settings (see :mod:`nsm.tasks.optimizers`).
+        lambda_normal: λ_n; 0 leaves the normal term out.
+        max_steps: length of the schedule.
+        diagonal: of the surface's bounding box, the unit of the errors that are logged.
+    """
+
+    def __init__(
+        self,
+        map: dict[str, Any],
+        optimizer: dict[str, Any],
+        scheduler: dict[str, Any],
+        lambda_normal: float,
+        max_steps: int,
+        diagonal: float,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self.map = build_map(map)
+        self.lambda_normal, self.diagonal = lambda_normal, diagonal
+
+    def forward(self, uv: Tensor) -> Tensor:
+        """(N, 2) points of Ω to (N, 3)."""
+        return self.map(uv)
+
+    def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        if self.lambda_normal == 0:
+            loss = position(self.map(batch.uv), batch.points).mean()
+            self.log("train/position", loss)
+        else:
+            value, jacobian = self.map.value_and_jacobian(batch.uv)
+            at = position(value, batch.points).mean()
+            turn = normal(jacobian, batch.normals).mean()
+            loss = at + self.lambda_normal * turn
+            self.log("train/position", at)
+            self.log("train/normal", turn)
+        self.log("train/loss", loss)
+        return loss
+
+    def validation_step(self, batch: Samples, batch_idx: int) -> None:
+        value, jacobian = self.map.value_and_jacobian(batch.uv)
+        squared = position(value, batch.points).mean()
+        cross = torch.linalg.cross(jacobian[:, :, 0], jacobian[:, :, 1])
+        cosine = torch.nn.functional.cosine_similarity(cross, batch.normals)
+        angle = torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean()
+        self.log("val/mean_squared_distance", squared, batch_size=len(value))
+        self.log("val/normal_error_degrees", angle, batch_size=len(value))
+
+    def on_validation_epoch_end(self) -> None:
+        # the root is taken after the mean over all batches
+        squared = self.trainer.callback_metrics["val/mean_squared_distance"]
+        self.log("val/rms_percent", 100 * squared.sqrt() / self.diagonal)
+
+    def configure_optimizers(self) -> Any:
+        optimizer = build_optimizer(self.map, dict(self.hparams["optimizer"]))
+        scheduler = build_scheduler(
+            optimizer, dict(self.hparams["scheduler"]), self.hparams["max_steps"]
+        )
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }

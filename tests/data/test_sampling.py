@@ -1,0 +1,96 @@
+"""Samples: uniform by area, on the surface, a function of (seed, step)."""
+
+import numpy as np
+import pytest
+import torch
+
+from nsm.data import OverfitData, SurfaceSampler
+from nsm.surfaces import Surface
+
+
+def nearest(points, others):
+    """Distance of each point to the nearest of the others, without cancellation."""
+    exact = "donot_use_mm_for_euclid_dist"
+    return torch.cdist(points, others, compute_mode=exact).min(dim=1).values
+
+
+@pytest.fixture(scope="module")
+def uneven() -> Surface:
+    """A flat rectangle of two halves: one cut fine, one coarse."""
+    fine = np.linspace(0, 1, 21)
+    x = np.concatenate([fine, [1.5, 2.0]])
+    y = np.linspace(0, 1, 11)
+    gx, gy = np.meshgrid(x, y, indexing="ij")
+    vertices = np.stack([gx.ravel(), gy.ravel(), np.zeros(gx.size)], axis=1)
+    columns = len(y)
+    a = (np.arange(len(x) - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    faces = np.concatenate(
+        [
+            np.stack([a, a + columns, a + columns + 1], axis=1),
+            np.stack([a, a + columns + 1, a + 1], axis=1),
+        ]
+    )
+    return Surface.from_arrays(vertices, faces, domain="square")
+
+
+def test_uniform_by_area_not_by_face(uneven):
+    sampler = SurfaceSampler(uneven)
+    points = sampler.by_area(40_000, sampler.generator(0)).points
+    # both halves have the same area, though one has ten times the faces
+    share = float((points[:, 0] < 0).float().mean())
+    assert share == pytest.approx(0.5, abs=0.01)
+
+
+def test_samples_lie_on_the_surface_with_its_normals(uneven):
+    sampler = SurfaceSampler(uneven)
+    samples = sampler.draw(1000, 0.3, sampler.generator(1))
+    assert len(samples.uv) == len(samples.points) == len(samples.normals) == 1000
+    assert torch.allclose(samples.points[:, 2], torch.tensor(0.0), atol=1e-6)
+    assert torch.allclose(samples.normals.abs()[:, 2], torch.tensor(1.0), atol=1e-6)
+    assert float(samples.uv.abs().max()) <= 1 + 1e-6
+    # the last 300 are vertices
+    assert float(nearest(samples.points[-300:], sampler.vertices).max()) < 1e-6
+
+
+def test_uv_and_points_correspond(uneven):
+    """The rectangle's map to its points is piecewise linear: barycentric weights must agree."""
+    sampler = SurfaceSampler(uneven)
+    samples = sampler.by_area(50, sampler.generator(2))
+    for uv, point in zip(samples.uv.numpy(), samples.points.numpy(), strict=True):
+        found = False
+        for face in uneven.faces:
+            t = np.vstack([uneven.uv[face].T, np.ones(3)])
+            weights = np.linalg.solve(t, [*uv, 1.0])
+            if (weights > -1e-4).all():
+                found |= bool(np.allclose(weights @ uneven.vertices[face], point, atol=1e-4))
+        assert found
+
+
+def test_a_batch_depends_on_seed_and_step_alone(uneven):
+    first, again = (OverfitData(uneven, batch_size=64, seed=3) for _ in range(2))
+    first.setup()
+    again.setup()
+    first.batch(0)
+    assert torch.equal(first.batch(7).points, again.batch(7).points)
+    assert not torch.equal(first.batch(7).points, first.batch(8).points)
+    other = OverfitData(uneven, batch_size=64, seed=4)
+    other.setup()
+    assert not torch.equal(first.batch(7).points, other.batch(7).points)
+
+
+def test_pool_holds_every_vertex(uneven):
+    data = OverfitData(uneven, batch_size=64, pool=1000)
+    data.setup()
+    assert len(data.pool.points) == 1000
+    assert float(nearest(data.sampler.vertices, data.pool.points).max()) < 1e-6
+    batch = data.batch(0)
+    assert float(nearest(batch.points, data.pool.points).max()) < 1e-6
+
+
+def test_held_out_points_are_not_trained_on(uneven):
+    data = OverfitData(uneven, batch_size=512, held_out=512)
+    data.setup()
+    held_out = torch.cat([chunk.uv for chunk in data.val_dataloader()])
+    assert len(held_out) == 512
+    for step in range(3):
+        assert float(nearest(held_out, data.batch(step).uv).min()) > 0

@@ -1,0 +1,72 @@
+"""Optimisers and schedules from settings."""
+
+import math
+
+import pytest
+import torch
+
+from nsm.maps import build_map
+from nsm.tasks.optimizers import build_optimizer, build_scheduler
+
+
+def rates(settings, max_steps, steps):
+    weight = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weight], lr=1.0)
+    scheduler = build_scheduler(optimizer, settings, max_steps)
+    out = []
+    for _ in range(steps):
+        out.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        scheduler.step()
+    return out
+
+
+def test_sgdr_restarts_with_growing_periods():
+    lr = rates({"name": "sgdr", "period": 10, "period_factor": 2.0}, 100, 40)
+    assert lr[0] == lr[10] == lr[30] == 1.0
+    assert lr[5] == pytest.approx(0.5)
+    assert lr[20] == pytest.approx(0.5)  # the middle of the second, longer period
+    assert max(lr[1:10]) < 1.0
+
+
+def test_cosine_falls_to_its_final_share():
+    lr = rates({"name": "cosine", "final": 0.1}, 50, 51)
+    assert lr[0] == 1.0
+    assert lr[25] == pytest.approx(0.55)
+    assert lr[50] == pytest.approx(0.1)
+    assert all(a > b for a, b in zip(lr, lr[1:], strict=False))
+
+
+def test_warmup_rises_linearly():
+    lr = rates({"name": "constant", "warmup": 4}, 50, 8)
+    assert lr == pytest.approx([0.2, 0.4, 0.6, 0.8, 1, 1, 1, 1])
+
+
+def test_feature_grids_take_their_own_rate():
+    network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
+    optimizer = build_optimizer(network, {"name": "adam", "lr": 1e-3, "encoding_lr": 1e-2})
+    by_rate = {g["lr"]: sum(p.numel() for p in g["params"]) for g in optimizer.param_groups}
+    assert by_rate[1e-2] == sum(p.numel() for p in network.encoding.parameters())
+    assert sum(by_rate.values()) == sum(p.numel() for p in network.parameters())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"name": "adamm", "lr": 1e-3},
+        {"name": "adam", "lr": 1e-3, "momentumm": 0.9},
+    ],
+)
+def test_unknown_settings_are_refused(settings):
+    with pytest.raises(ValueError, match="optimizer"):
+        build_optimizer(torch.nn.Linear(2, 2), settings)
+
+
+def test_unknown_schedule_is_refused():
+    with pytest.raises(ValueError, match="scheduler 'cosin'"):
+        build_scheduler(torch.optim.SGD([torch.zeros(1)], lr=1.0), {"name": "cosin"}, 10)
+
+
+def test_cosine_is_half_a_wave():
+    lr = rates({"name": "cosine"}, 10, 10)
+    assert lr == pytest.approx([0.5 * (1 + math.cos(math.pi * k / 10)) for k in range(10)])
