@@ -205,7 +205,7 @@ def _slim_held(
 
 def _sliding_steps(n_faces: int) -> int:
     """How many sliding steps a mesh gets, so that time stays within seconds."""
-    return int(np.clip(400_000 / n_faces, 4, 40))
+    return int(np.clip(800_000 / n_faces, 6, 60))
 
 
 def slide(
@@ -232,7 +232,9 @@ def slide(
         direction = _proxy_step(gradient, area, faces, uv, inner, moving, domain)
         if direction is None:
             break
-        step, improved = 1.0, False
+        # full steps flip triangles while some are needles: start short of the first to collapse
+        step = min(1.0, 0.8 * _collapse_step(uv, direction, faces, inner, moving, domain))
+        improved = False
         for _ in range(14):
             trial = _move(uv, direction, step, inner, moving, domain)
             value = _energy(gradient, area, faces, trial)
@@ -297,12 +299,12 @@ def _proxy_step(
     """Minimiser of the proxy: steps of inner vertices (2 each, x then y), then of moving ones."""
     u, s, vt = np.linalg.svd(_jacobians(gradient, faces, uv))
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    s = s.clip(1e-9)
+    s = s.clip(1e-14)
     u[:, :, 1] *= sign[:, None]
     rotation = u @ vt
     # weights that give the proxy the gradient of s^2 + s^-2 at this point (limit 2 at s = 1)
     near = np.abs(s - 1) < 1e-6
-    weight2 = np.where(near, 4.0, (s - s**-3) / np.where(near, 1.0, s - 1)).clip(1e-8, 1e12)
+    weight2 = np.where(near, 4.0, (s - s**-3) / np.where(near, 1.0, s - 1)).clip(1e-8)
     w2 = np.einsum("fij,fj,fkj->fik", u, weight2, u) * area[:, None, None]
     # quadratic form in the displacement d: 1/2 d'Hd + g'd, residual (J - R) at d = 0
     residual = _jacobians(gradient, faces, uv) - rotation
@@ -339,6 +341,41 @@ def _proxy_step(
     except RuntimeError:
         return None
     return result if np.isfinite(result).all() else None
+
+
+def _collapse_step(
+    uv: np.ndarray,
+    direction: np.ndarray,
+    faces: np.ndarray,
+    inner: np.ndarray,
+    moving: np.ndarray,
+    domain: str,
+) -> float:
+    """The step at which the first triangle loses its area (Smith and Schaefer 2015), or inf.
+
+    Arcs of the boundary count as their tangents, so the search may have to shorten it still.
+    """
+    k = len(inner)
+    displacement = np.zeros_like(uv)
+    displacement[inner] = direction[: 2 * k].reshape(2, k).T
+    displacement[moving] = direction[2 * k :, None] * _tangents(uv[moving], domain)
+    a, b, c = (uv[faces[:, i]] for i in range(3))
+    da, db, dc = (displacement[faces[:, i]] for i in range(3))
+    # twice the area at step t is p t^2 + q t + r with r > 0
+    p = _cross(db - da, dc - da)
+    q = _cross(b - a, dc - da) + _cross(db - da, c - a)
+    r = _cross(b - a, c - a)
+    # the smallest positive root as 2r / (sqrt(q^2 - 4pr) - q), which is stable for small p
+    discriminant = q**2 - 4 * p * r
+    denominator = np.sqrt(discriminant.clip(0.0)) - q
+    collapses = (discriminant >= 0) & (denominator > 0)
+    if not collapses.any():
+        return float("inf")
+    return float((2 * r[collapses] / denominator[collapses]).min())
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
 
 
 def _tangents(points: np.ndarray, domain: str) -> np.ndarray:

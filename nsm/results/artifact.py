@@ -1,0 +1,183 @@
+"""Neural surfaces as files: weights and arrays in safetensors, everything else in JSON.
+
+Loading executes nothing from the files: there is no pickle in them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from nsm.errors import NsmError
+from nsm.maps import build_map
+from nsm.results.files import atomic_write
+from nsm.surfaces import Surface
+
+FORMAT = "nsm-surface"
+VERSION = 1
+TENSOR_FILE = "surface.safetensors"
+WORDS_FILE = "surface.json"
+_ARRAYS = ("vertices", "faces", "uv", "source_vertex", "twins", "center")
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralSurface:
+    """A network φ: Ω → R³ that is a surface, with the mesh that it was fitted to.
+
+    Attributes:
+        surface: the prepared mesh, in normalised units, as φ's values are.
+        map: the network, frozen.
+        metrics: figures of :func:`nsm.results.overfit_metrics`.
+        config: the settings of the run that made it.
+    """
+
+    surface: Surface
+    map: nn.Module
+    metrics: dict[str, float] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+
+    @overload
+    def __call__(self, uv: np.ndarray) -> np.ndarray: ...
+    @overload
+    def __call__(self, uv: Tensor) -> Tensor: ...
+    def __call__(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
+        """Points (N, 2) of Ω to points (N, 3) of the surface; numpy for numpy, torch for torch."""
+        if isinstance(uv, Tensor):
+            return self.map(uv)
+        with torch.no_grad():
+            return self.map(self._tensor(uv)).cpu().numpy().astype(np.float64)
+
+    @overload
+    def jacobian(self, uv: np.ndarray) -> np.ndarray: ...
+    @overload
+    def jacobian(self, uv: Tensor) -> Tensor: ...
+    def jacobian(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
+        """Jacobians (N, 3, 2) at points (N, 2) of Ω."""
+        if isinstance(uv, Tensor):
+            return self.map.value_and_jacobian(uv)[1]  # type: ignore[operator]
+        with torch.no_grad():
+            jacobian = self.map.value_and_jacobian(self._tensor(uv))[1]  # type: ignore[operator]
+        return jacobian.cpu().numpy().astype(np.float64)
+
+    def _tensor(self, uv: np.ndarray) -> Tensor:
+        like = next(self.map.parameters())
+        return torch.as_tensor(np.asarray(uv), dtype=like.dtype, device=like.device)
+
+    def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2)."""
+        return self(self.surface.uv), self.surface.faces, self.surface.uv
+
+    def in_original_units(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the surface in the units and place of the mesh file."""
+        return points / self.surface.scale + self.surface.center
+
+    def save(self, folder: str | Path) -> None:
+        """Write the two files of :func:`save_surface`."""
+        save_surface(folder, self)
+
+
+def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
+    """Write ``surface.safetensors`` and ``surface.json`` into a folder, whole or not at all.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    surface = neural.surface
+    tensors = {f"map.{key}": value.contiguous() for key, value in neural.map.state_dict().items()}
+    for name in _ARRAYS:
+        array = np.ascontiguousarray(getattr(surface, name))
+        tensors[f"surface.{name}"] = torch.from_numpy(array.copy())
+    data = save_tensors(tensors)
+    words = {
+        "format": FORMAT,
+        "version": VERSION,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "map": neural.map.config,
+        "surface": {
+            "name": surface.name,
+            "domain": surface.domain,
+            "scale": surface.scale,
+            "quality": surface.quality,
+            "log": list(surface.log),
+        },
+        "metrics": neural.metrics,
+        "config": neural.config,
+    }
+    atomic_write(target / TENSOR_FILE, data)
+    atomic_write(target / WORDS_FILE, (json.dumps(words, indent=2) + "\n").encode())
+
+
+def load_surface(folder: str | Path) -> NeuralSurface:
+    """Read what :func:`save_surface` wrote, from its folder or from ``surface.safetensors``.
+
+    Raises:
+        NsmError: files that are missing, truncated, damaged, or of another version.
+    """
+    path = Path(folder)
+    if path.name == TENSOR_FILE:
+        path = path.parent
+    words = _read_words(path / WORDS_FILE)
+    data = _read_bytes(path / TENSOR_FILE)
+    if hashlib.sha256(data).hexdigest() != words.get("sha256"):
+        raise NsmError(
+            f"{path / TENSOR_FILE}: truncated or changed (its checksum is not the one in "
+            f"{WORDS_FILE}); run the overfit again or copy the folder again"
+        )
+    try:
+        tensors = load_tensors(data)
+        about = words["surface"]
+        arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in _ARRAYS}
+        surface = Surface(
+            name=str(about["name"]),
+            domain=str(about["domain"]),
+            scale=float(about["scale"]),
+            quality=dict(about["quality"]),
+            log=tuple(about["log"]),
+            **arrays,
+        )
+        network = build_map(words["map"])
+        network.load_state_dict({k.removeprefix("map."): v for k, v in tensors.items()})
+        metrics, config = dict(words["metrics"]), dict(words["config"])
+    except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise NsmError(
+            f"{path}: the two files do not fit together ({reason}); run the overfit again"
+        ) from error
+    network.eval().requires_grad_(False)
+    return NeuralSurface(surface, network, metrics, config)
+
+
+def _read_bytes(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise NsmError(
+            f"{file}: {error.strerror or 'cannot be read'}; give the folder of a complete run"
+        ) from error
+
+
+def _read_words(file: Path) -> dict[str, Any]:
+    try:
+        words = json.loads(_read_bytes(file))
+    except ValueError as error:
+        raise NsmError(f"{file}: not readable as JSON; run the overfit again") from error
+    if not isinstance(words, dict) or words.get("format") != FORMAT:
+        raise NsmError(f"{file}: not a neural surface of nsm; give the folder of an overfit run")
+    if words.get("version") != VERSION:
+        raise NsmError(
+            f"{file}: version {words.get('version')}, but this nsm reads version {VERSION}; "
+            "run the overfit again with this nsm"
+        )
+    return words

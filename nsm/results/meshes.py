@@ -1,0 +1,62 @@
+"""Meshes with UV as OBJ or GLB."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nsm.errors import NsmError
+from nsm.results.files import atomic_write
+
+
+def export_mesh(
+    path: str | Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    *,
+    texture: Image.Image | None = None,
+) -> None:
+    """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
+
+    Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². With a texture, GLB holds
+    it; OBJ gets a material file and a PNG beside it.
+
+    Raises:
+        NsmError: the file's ending is neither .obj nor .glb.
+    """
+    target = Path(path)
+    coordinates = 0.5 * (np.asarray(uv) + 1)
+    if target.suffix == ".glb":
+        atomic_write(target, _glb(vertices, faces, coordinates, texture))
+        return
+    if target.suffix != ".obj":
+        raise NsmError(f"{target}: meshes are written as .obj or .glb")
+    head = ""
+    if texture is not None:
+        picture = io.BytesIO()
+        texture.save(picture, format="PNG")
+        atomic_write(target.with_suffix(".png"), picture.getvalue())
+        material = f"newmtl surface\nKd 1 1 1\nmap_Kd {target.stem}.png\n"
+        atomic_write(target.with_suffix(".mtl"), material.encode())
+        head = f"mtllib {target.stem}.mtl\nusemtl surface\n"
+    lines = [head]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices.tolist()]
+    lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
+    lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
+    atomic_write(target, "".join(lines).encode())
+
+
+def _glb(
+    vertices: np.ndarray, faces: np.ndarray, coordinates: np.ndarray, texture: Image.Image | None
+) -> bytes:
+    import trimesh
+
+    visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
+    mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+    data = trimesh.Scene({"surface": mesh}).export(file_type="glb")
+    assert isinstance(data, bytes)
+    return data

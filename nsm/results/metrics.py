@@ -1,0 +1,132 @@
+"""Quality of a neural surface, measured on points that no training has seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import nn
+
+from nsm.surfaces import Surface
+from nsm.surfaces.geometry import point_mesh_distance, subdivide
+
+_CHUNK = 16_384
+# A triangle whose area φ shrinks below this share of the true one has collapsed.
+DEGENERATE_STRETCH = 1e-3
+
+
+def evaluate(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
+    """φ at points (N, 2) of Ω, as float64 (N, 3)."""
+    with torch.no_grad():
+        parts = [phi(chunk).double().cpu().numpy() for chunk in _chunks(phi, uv)]
+    return np.concatenate(parts)
+
+
+def evaluate_jacobian(phi: nn.Module, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """φ (N, 3) and its Jacobian (N, 3, 2) at points (N, 2) of Ω, as float64."""
+    with torch.no_grad():
+        parts = [phi.value_and_jacobian(chunk) for chunk in _chunks(phi, uv)]  # type: ignore[operator]
+    values, jacobians = zip(*parts, strict=True)
+    return (
+        torch.cat(values).double().cpu().numpy(),
+        torch.cat(jacobians).double().cpu().numpy(),
+    )
+
+
+def _chunks(phi: nn.Module, uv: np.ndarray) -> Iterator[torch.Tensor]:
+    like = next(phi.parameters(), torch.zeros(0))
+    for start in range(0, max(len(uv), 1), _CHUNK):
+        yield torch.as_tensor(uv[start : start + _CHUNK], dtype=like.dtype, device=like.device)
+
+
+def vertex_error(surface: Surface, phi: nn.Module) -> np.ndarray:
+    """Distance (V,) between φ and the mesh at each vertex, in percent of the diagonal."""
+    distance = np.linalg.norm(evaluate(phi, surface.uv) - surface.vertices, axis=1)
+    return 100 * distance / surface.bounding_box_diagonal
+
+
+def overfit_metrics(
+    surface: Surface, phi: nn.Module, *, samples: int = 100_000, seed: int = 0
+) -> dict[str, float]:
+    """The figures of METHOD's "How quality is measured" for an overfitted network.
+
+    Distances are in percent of the diagonal of the mesh's bounding box, angles in degrees.
+
+    Args:
+        surface: the prepared surface.
+        phi: the network, with ``value_and_jacobian``.
+        samples: how many points, uniform by area on the mesh.
+        seed: of these points; they are never those of a training.
+
+    Returns:
+        rms_percent and max_percent at matching uv; hausdorff_mesh_to_phi_percent and
+        hausdorff_phi_to_mesh_percent, one-sided; normal_error_mean_degrees,
+        normal_error_p95_degrees; degenerate_triangles_percent; seam_gap_percent, the largest
+        distance between the images of two seam vertices that were one point.
+    """
+    to_percent = 100 / surface.bounding_box_diagonal
+    corners = surface.vertices[surface.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double_area = np.linalg.norm(cross, axis=1)
+    normals = cross / np.maximum(double_area, 1e-300)[:, None]
+
+    uv, points, face = _random_points(surface, double_area, samples, seed)
+    value, jacobian = evaluate_jacobian(phi, uv)
+    distance = np.linalg.norm(value - points, axis=1) * to_percent
+    angle = _angles(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]), normals[face])
+
+    # φ's surface as a mesh finer than the source, for the distances between the two
+    fine_uv, fine_faces = subdivide(surface.uv, surface.faces)
+    image = evaluate(phi, fine_uv)
+    there = point_mesh_distance(points, image, fine_faces)
+    back = point_mesh_distance(image, surface.vertices, surface.faces)
+    seam = surface.uv[surface.twins.ravel()]
+    gap = np.zeros(1)
+    if len(seam):
+        pairs = evaluate(phi, seam).reshape(-1, 2, 3)
+        gap = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1)
+    return {
+        "rms_percent": float(np.sqrt((distance**2).mean())),
+        "max_percent": float(distance.max()),
+        "hausdorff_mesh_to_phi_percent": float(there.max() * to_percent),
+        "hausdorff_phi_to_mesh_percent": float(back.max() * to_percent),
+        "normal_error_mean_degrees": float(angle.mean()),
+        "normal_error_p95_degrees": float(np.percentile(angle, 95)),
+        "degenerate_triangles_percent": 100 * _degenerate_share(surface, phi, double_area),
+        "seam_gap_percent": float(gap.max() * to_percent),
+    }
+
+
+def _random_points(
+    surface: Surface, area: np.ndarray, count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """uv (N, 2), points (N, 3) and faces (N,), uniform by area on the mesh."""
+    random = np.random.default_rng([seed, 0xFACE])
+    face = random.choice(len(area), size=count, p=area / area.sum())
+    root, r = np.sqrt(random.random(count)), random.random(count)
+    weights = np.stack([1 - root, root * (1 - r), root * r], axis=1)[:, :, None]
+    corners = surface.faces[face]
+    uv = (weights * surface.uv[corners]).sum(axis=1)
+    return uv, (weights * surface.vertices[corners]).sum(axis=1), face
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (N,) between vectors (N, 3), in degrees; 180 where one is not finite.
+
+    By the arc tangent: the arc cosine of float values near 1 would not resolve small angles.
+    """
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    angle = np.degrees(np.arctan2(sine, (a * b).sum(axis=1)))
+    return np.where(np.isfinite(angle), angle, 180.0)
+
+
+def _degenerate_share(surface: Surface, phi: nn.Module, double_area: np.ndarray) -> float:
+    center = surface.uv[surface.faces].mean(axis=1)
+    jacobian = evaluate_jacobian(phi, center)[1]
+    element = np.linalg.norm(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]), axis=1)
+    a, b, c = (surface.uv[surface.faces[:, k]] for k in range(3))
+    u, v = b - a, c - a
+    flat = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    good = element * flat >= DEGENERATE_STRETCH * double_area
+    return float(1 - good.mean())

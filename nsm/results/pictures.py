@@ -1,0 +1,99 @@
+"""Pictures of surfaces: error beside the source, checkerboards, and quick looks for monitoring."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from torch import nn
+
+from nsm.results.files import atomic_write
+from nsm.results.metrics import evaluate, vertex_error
+from nsm.results.render import View
+from nsm.results.textures import checkerboard_at
+from nsm.surfaces import Surface
+from nsm.surfaces.geometry import subdivide
+
+if TYPE_CHECKING:
+    from nsm.results.artifact import NeuralSurface
+
+_GREY = np.array([0.80, 0.82, 0.85])
+_PANEL = 640
+# the reconstruction is drawn with at least this many triangles, so that φ itself is seen
+_FINE_FACES = 30_000
+
+
+def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
+    """Source beside reconstruction, coloured by distance in percent of the diagonal."""
+    error = vertex_error(surface, neural.map)
+    scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
+    view = View(surface.vertices, _PANEL)
+    grey = np.broadcast_to(_GREY, surface.vertices.shape)
+    source = view.draw(surface.vertices, surface.faces, grey)
+    colours = scale.to_rgba(error)[:, :3]
+    image = view.draw(evaluate(neural.map, surface.uv), surface.faces, colours)
+    rms = neural.metrics.get("rms_percent")
+    title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
+    figure = _panels([(source, f"{surface.name}: mesh"), (image, title)])
+    figure.colorbar(
+        scale,
+        cax=figure.add_axes((0.94, 0.2, 0.012, 0.6)),
+        label="distance, % of the diagonal",
+        extend="max",
+    )
+    _save(figure, path)
+
+
+def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
+    """The neural surface with Ω's checkerboard on it, beside Ω."""
+    uv, faces = _fine(surface)
+    image = View(surface.vertices, _PANEL).draw(evaluate(neural.map, uv), faces, None, uv=uv)
+    side = 1.06 * (2 * (np.arange(_PANEL) + 0.5) / _PANEL - 1)
+    grid = np.stack(np.meshgrid(side, side[::-1]), axis=-1)
+    inside = (
+        (grid**2).sum(axis=-1) <= 1
+        if surface.domain == "disc"
+        else (np.abs(grid) <= 1).all(axis=-1)
+    )
+    flat = checkerboard_at(grid.reshape(-1, 2)).reshape(_PANEL, _PANEL, 3)
+    flat = np.where(inside[:, :, None], flat, 1.0)
+    titles = f"{surface.name}: neural surface", f"domain Ω: {surface.domain}"
+    _save(_panels([(image, titles[0]), (flat, titles[1])]), path)
+
+
+def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -> np.ndarray:
+    """A quick picture (size, size, 3) uint8 of the surface as φ has it now."""
+    uv, faces = _fine(surface)
+    points = evaluate(phi, uv)
+    grey = np.broadcast_to(_GREY, points.shape)
+    return np.round(255 * View(surface.vertices, size).draw(points, faces, grey)).astype(np.uint8)
+
+
+def _fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    uv, faces = surface.uv, surface.faces
+    while len(faces) < _FINE_FACES:
+        uv, faces = subdivide(uv, faces)
+    return uv, faces
+
+
+def _panels(panels: list[tuple[np.ndarray, str]]) -> Any:
+    figure = Figure(figsize=(5.5 * len(panels) + 0.6, 5.5), dpi=120)
+    for k, (image, title) in enumerate(panels):
+        axes = figure.add_subplot(1, len(panels), k + 1)
+        axes.imshow(image, interpolation="antialiased")
+        axes.set_title(title)
+        axes.set_axis_off()
+    figure.subplots_adjust(left=0.01, right=0.92, top=0.93, bottom=0.01, wspace=0.02)
+    return figure
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    data = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(data)
+    atomic_write(path, data.getvalue())
