@@ -28,7 +28,7 @@ from rich.table import Table
 
 from nsm.config import compose_config
 from nsm.data import OverfitData
-from nsm.pipeline import build_overfit
+from nsm.pipeline import build_overfit, quiet_lightning
 from nsm.results import atomic_write, overfit_metrics
 from nsm.results.callbacks import GradientWatch
 from nsm.surfaces import Surface
@@ -171,6 +171,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULT)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    quiet_lightning()
     done = json.loads(arguments.output.read_text())["runs"] if arguments.output.exists() else {}
     console = Console()
 

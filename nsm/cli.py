@@ -16,38 +16,47 @@ from nsm.config import checked, conf_folder, one_line, register_resolvers
 from nsm.errors import NsmError
 
 
-@hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
-def _run(config: DictConfig) -> None:
+def _run(config: DictConfig) -> bool:
+    """Run one job; False if its input was bad, so that the other jobs of a sweep go on."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
+        typed = checked(config)
         from nsm.pipeline import run
 
-        run(checked(config), folder)
-    except BaseException:
+        run(typed, folder)
+    except NsmError as error:
+        _say(str(error))
+        return False
+    finally:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()  # nothing came of it: leave no empty folder behind
-        raise
+    return True
 
 
 def main() -> None:
-    """Entry point. Exit status 0, or 2 for bad input (one line on stderr), or 130 if interrupted."""
+    """Entry point. Exit status 0, 2 for bad input (one line on stderr) or 130 if interrupted."""
     register_resolvers()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach us instead of being printed
+    results: list[bool] = []
+
+    @hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
+    def job(config: DictConfig) -> None:
+        results.append(_run(config))
+
     try:
-        _run()
+        job()
     except (HydraException, OmegaConfBaseException) as error:
-        cause = error.__cause__ if isinstance(error.__cause__, NsmError) else error
-        _fail(str(cause) if isinstance(cause, NsmError) else one_line(cause))
-    except NsmError as error:
-        _fail(str(error))
+        _say(one_line(error))
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
+    if not all(results):
+        sys.exit(2)
 
 
-def _fail(message: str) -> None:
+def _say(message: str) -> None:
     print(f"nsm: {message}", file=sys.stderr)
-    sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -191,5 +191,5 @@ def known_keys() -> list[str]:
         if not isinstance(loaded, DictConfig):
             continue
         prefix = f"{file.parent.name}." if file.parent != conf_folder() else ""
-        keys += [f"{prefix}{key}" for key in loaded if key not in ("defaults", "hydra")]
+        keys += [f"{prefix}{key}" for key in map(str, loaded) if key not in ("defaults", "hydra")]
     return sorted(set(keys))

@@ -52,9 +52,7 @@ def run(config: DictConfig, folder: Path) -> None:
     tasks[config.task.name](config, folder)
 
 
-def run_overfit(
-    config: DictConfig, folder: Path, surface: Surface | None = None
-) -> NeuralSurface:
+def run_overfit(config: DictConfig, folder: Path, surface: Surface | None = None) -> NeuralSurface:
     """Overfit one surface, and leave all of its results in the folder.
 
     Args:
@@ -78,13 +76,14 @@ def run_overfit(
         surface = _load_surface(config)
     _report_surface(console, surface)
     module = build_overfit(config, surface)
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
-
     data = OverfitData(
-        surface, **OmegaConf.to_container(config.data), seed=config.seed  # type: ignore[arg-type]
+        surface,
+        **OmegaConf.to_container(config.data),
+        seed=config.seed,  # type: ignore[arg-type]
     )
     trainer = _trainer(config, folder, surface, console)
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
     _fit(trainer, module, data, checkpoint)
     if trainer.interrupted:
         console.print(f"interrupted; go on with: nsm resume={folder}")
@@ -180,10 +179,7 @@ def _trainer(config: DictConfig, folder: Path, surface: Surface, console: Consol
     if config.logger.tensorboard:
         logger = TensorBoardLogger(save_dir=folder, name="", version="tensorboard")
         callbacks += [LearningRateMonitor(), Pictures(surface, config.logger.pictures)]
-    # Lightning's remarks on data loaders and hardware do not concern samples made on the device
-    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", module="pytorch_lightning")
-    warnings.filterwarnings("ignore", module="lightning_fabric")
+    quiet_lightning()
     try:
         return pl.Trainer(
             accelerator=settings.accelerator,
@@ -203,9 +199,15 @@ def _trainer(config: DictConfig, folder: Path, surface: Surface, console: Consol
         raise NsmError(f"setting trainer.accelerator={settings.accelerator}: {reason}") from error
 
 
-def _fit(
-    trainer: pl.Trainer, module: Overfit, data: OverfitData, checkpoint: Path | None
-) -> None:
+def quiet_lightning() -> None:
+    """Leave out Lightning's remarks on data loaders and hardware: they do not concern samples that
+    are made on the device."""
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="pytorch_lightning")
+    warnings.filterwarnings("ignore", module="lightning_fabric")
+
+
+def _fit(trainer: pl.Trainer, module: Overfit, data: OverfitData, checkpoint: Path | None) -> None:
     if checkpoint is None:
         trainer.fit(module, datamodule=data)
         return

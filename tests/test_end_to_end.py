@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,10 +15,12 @@ import torch
 import trimesh
 
 import nsm
+from nsm import cli
 
 QUICK = [
     "experiment=quick",
     "data.held_out=2048",
+    "trainer.threads=1",
     "logger.every=10",
 ]
 
@@ -31,6 +34,25 @@ def run(folder: Path, *words: str, **extra) -> subprocess.CompletedProcess:
     return subprocess.run(
         command(*words), cwd=folder, env=environment, capture_output=True, text=True, **extra
     )
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, capfd):
+    """Run the command within this process, in a folder of its own: imports take seconds."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
+
+    def call(*words: str) -> subprocess.CompletedProcess:
+        monkeypatch.setattr(sys, "argv", ["nsm", *words])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+        out, err = capfd.readouterr()
+        return subprocess.CompletedProcess(words, status, out, err)
+
+    return call
 
 
 def only_run_folder(folder: Path) -> Path:
@@ -52,7 +74,7 @@ def finished(tmp_path_factory) -> tuple[Path, Path, str]:
 def test_it_prints_what_was_done_and_where_the_results_are(finished):
     _, folder, text = finished
     assert "cut along" in text  # the closed ball needed a seam
-    assert f"results in {Path('outputs') / 'overfit' / folder.name}" in text
+    assert f"results in {folder}" in text
     assert "RMS" in text.upper()
 
 
@@ -225,9 +247,14 @@ def unknown_format(folder: Path) -> None:
         (lambda folder: None, "missing.obj", "no such file"),
     ],
 )
-def test_a_bad_mesh_is_one_line_and_status_2(tmp_path, make, file, words):
+def test_a_bad_mesh_is_one_line_and_status_2(tmp_path, here, make, file, words):
     make(tmp_path)
-    refused(run(tmp_path, f"surface.path={file}", *QUICK), words, tmp_path)
+    refused(here(f"surface.path={file}", *QUICK), words, tmp_path)
+
+
+def test_bad_input_in_a_process_of_its_own(tmp_path):
+    two_balls(tmp_path)
+    refused(run(tmp_path, "surface.path=bad.obj"), "separate parts", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -246,8 +273,8 @@ def test_a_bad_mesh_is_one_line_and_status_2(tmp_path, make, file, words):
         (["resume=nowhere"], "nowhere"),
     ],
 )
-def test_a_bad_setting_is_one_line_and_status_2(tmp_path, words, expected):
-    refused(run(tmp_path, *words), expected, tmp_path)
+def test_a_bad_setting_is_one_line_and_status_2(tmp_path, here, words, expected):
+    refused(here(*words), expected, tmp_path)
 
 
 def refused(result: subprocess.CompletedProcess, expected: str, folder: Path) -> None:
@@ -260,14 +287,13 @@ def refused(result: subprocess.CompletedProcess, expected: str, folder: Path) ->
     assert [p for p in left if not p.name.startswith("bad.")] == []
 
 
-def test_a_damaged_checkpoint_is_told(finished, tmp_path):
-    import shutil
-
+def test_a_damaged_checkpoint_is_told(finished, tmp_path, here, monkeypatch):
     work, folder, _ = finished
+    monkeypatch.chdir(work)
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)
     (copy / "last.ckpt").write_bytes((copy / "last.ckpt").read_bytes()[:1000])
-    result = run(work, f"resume={copy}")
+    result = here(f"resume={copy}")
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1
     assert "last.ckpt" in result.stderr

@@ -13,8 +13,8 @@ from nsm.energies.constraints import (
     signed_distance,
 )
 from nsm.energies.distortion import (
-    area,
     arap,
+    area,
     conformal,
     dirichlet,
     equiareal_conformal,

@@ -92,7 +92,7 @@ def conformal(m: Invariants) -> Tensor:
     By ‖M‖² = t² − 2d, the norm of the symmetric matrix J_fᵀJ_f to which M is similar. The
     figures of at least one that the paper reports are ``singular_value_ratio``.
     """
-    share = (m.determinant / (m.trace**2 + _VANISHING)).clamp(max=0.25)
+    share = m.determinant / (m.trace**2 + _VANISHING)
     return (1 - 4 * share) / (1 - 2 * share)
 
 

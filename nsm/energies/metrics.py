@@ -63,7 +63,7 @@ def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
         target: B (..., 2, 2), positive semidefinite.
 
     Returns:
-        ``Invariants`` in float64, both at least zero.
+        ``Invariants`` in float64, 0 ≤ d ≤ t²/4.
 
     Raises:
         ValueError: a metric is not (..., 2, 2).
@@ -76,9 +76,10 @@ def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
     a, c = a + SOURCE_FLOOR, c + SOURCE_FLOOR
     trace_a = (a + c).clamp(min=2 * SOURCE_FLOOR)
     det_a = torch.maximum(a * c - b * b, torch.finfo(source.dtype).eps * trace_a**2)
-    trace = (c * e - 2 * b * f + a * g) / det_a
-    determinant = (e * g - f * f) / det_a
-    return Invariants(trace.clamp(min=0), determinant.clamp(min=0))
+    trace = ((c * e - 2 * b * f + a * g) / det_a).clamp(min=0)
+    determinant = ((e * g - f * f) / det_a).clamp(min=0)
+    # d ≤ t²/4 for every pair of metrics; rounding of a collapsed one must not break it
+    return Invariants(trace, torch.minimum(determinant, trace**2 / 4))
 
 
 def _entries(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:

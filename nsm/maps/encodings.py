@@ -52,9 +52,7 @@ class RandomFourierFeatures(nn.Module):
         value = torch.cat([x, sine, cosine], dim=-1)
         rows = self.frequencies.T[:, None, :]  # (2, 1, features): dz/dx_i
         unit = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)[:, None, :]
-        tangents = torch.cat(
-            [unit.expand(-1, x.shape[0], -1), rows * cosine, -rows * sine], dim=-1
-        )
+        tangents = torch.cat([unit.expand(-1, x.shape[0], -1), rows * cosine, -rows * sine], dim=-1)
         return torch.cat([value[None], tangents])
 
 

@@ -111,7 +111,7 @@ class NeuralMap(nn.Module):
         name = encoding.pop("name")
         if name not in ENCODINGS:
             raise ValueError(f"encoding {name!r} is not one of {', '.join(ENCODINGS)}")
-        self.encoding = ENCODINGS[name](2, **encoding)
+        self.encoding: Encoding = ENCODINGS[name](2, **encoding)
         self.activation = Activation(**activation)
         self.input = nn.Linear(self.encoding.out_dim, width)
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))

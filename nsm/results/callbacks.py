@@ -10,6 +10,7 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback
+from pytorch_lightning.loggers import TensorBoardLogger
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
@@ -96,15 +97,12 @@ class Pictures(Callback):
     def __init__(self, surface: Surface, count: int) -> None:
         self.surface, self.count, self.taken = surface, count, 0
 
-    def on_validation_epoch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule
-    ) -> None:
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         share = trainer.global_step / max(1, trainer.max_steps)
         due = int(share * self.count)
-        if due <= self.taken or trainer.logger is None:
+        board = trainer.logger
+        if due <= self.taken or not isinstance(board, TensorBoardLogger):
             return
         self.taken = due
-        image = reconstruction_image(self.surface, pl_module.map, size=384)
-        trainer.logger.experiment.add_image(
-            "surface", image, trainer.global_step, dataformats="HWC"
-        )
+        image = reconstruction_image(self.surface, pl_module, size=384)
+        board.experiment.add_image("surface", image, trainer.global_step, dataformats="HWC")

@@ -57,6 +57,6 @@ def _glb(
 
     visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
     mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
-    data = trimesh.Scene({"surface": mesh}).export(file_type="glb")
+    data = trimesh.Scene(mesh).export(file_type="glb")
     assert isinstance(data, bytes)
     return data

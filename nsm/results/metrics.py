@@ -19,19 +19,15 @@ DEGENERATE_STRETCH = 1e-3
 def evaluate(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
     """φ at points (N, 2) of Ω, as float64 (N, 3)."""
     with torch.no_grad():
-        parts = [phi(chunk).double().cpu().numpy() for chunk in _chunks(phi, uv)]
-    return np.concatenate(parts)
+        return torch.cat([phi(chunk) for chunk in _chunks(phi, uv)]).double().cpu().numpy()
 
 
 def evaluate_jacobian(phi: nn.Module, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """φ (N, 3) and its Jacobian (N, 3, 2) at points (N, 2) of Ω, as float64."""
     with torch.no_grad():
         parts = [phi.value_and_jacobian(chunk) for chunk in _chunks(phi, uv)]  # type: ignore[operator]
-    values, jacobians = zip(*parts, strict=True)
-    return (
-        torch.cat(values).double().cpu().numpy(),
-        torch.cat(jacobians).double().cpu().numpy(),
-    )
+        values, jacobians = (torch.cat(part).double().cpu() for part in zip(*parts, strict=True))
+    return values.detach().numpy(), jacobians.detach().numpy()
 
 
 def _chunks(phi: nn.Module, uv: np.ndarray) -> Iterator[torch.Tensor]:

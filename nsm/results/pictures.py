@@ -15,7 +15,7 @@ from torch import nn
 
 from nsm.results.files import atomic_write
 from nsm.results.metrics import evaluate, vertex_error
-from nsm.results.render import View
+from nsm.results.render import Blend, View
 from nsm.results.textures import checkerboard_at
 from nsm.surfaces import Surface
 from nsm.surfaces.geometry import subdivide
@@ -34,10 +34,9 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     error = vertex_error(surface, neural.map)
     scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
     view = View(surface.vertices, _PANEL)
-    grey = np.broadcast_to(_GREY, surface.vertices.shape)
-    source = view.draw(surface.vertices, surface.faces, grey)
+    source = view.draw(surface.vertices, surface.faces, _grey)
     colours = scale.to_rgba(error)[:, :3]
-    image = view.draw(evaluate(neural.map, surface.uv), surface.faces, colours)
+    image = view.draw(evaluate(neural.map, surface.uv), surface.faces, lambda blend: blend(colours))
     rms = neural.metrics.get("rms_percent")
     title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
     figure = _panels([(source, f"{surface.name}: mesh"), (image, title)])
@@ -53,14 +52,13 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
 def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
     """The neural surface with Ω's checkerboard on it, beside Ω."""
     uv, faces = _fine(surface)
-    image = View(surface.vertices, _PANEL).draw(evaluate(neural.map, uv), faces, None, uv=uv)
+    image = View(surface.vertices, _PANEL).draw(
+        evaluate(neural.map, uv), faces, lambda blend: checkerboard_at(blend(uv))
+    )
     side = 1.06 * (2 * (np.arange(_PANEL) + 0.5) / _PANEL - 1)
     grid = np.stack(np.meshgrid(side, side[::-1]), axis=-1)
-    inside = (
-        (grid**2).sum(axis=-1) <= 1
-        if surface.domain == "disc"
-        else (np.abs(grid) <= 1).all(axis=-1)
-    )
+    order = 2 if surface.domain == "disc" else np.inf
+    inside = np.linalg.norm(grid, ord=order, axis=-1) <= 1
     flat = checkerboard_at(grid.reshape(-1, 2)).reshape(_PANEL, _PANEL, 3)
     flat = np.where(inside[:, :, None], flat, 1.0)
     titles = f"{surface.name}: neural surface", f"domain Ω: {surface.domain}"
@@ -70,9 +68,12 @@ def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurfa
 def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -> np.ndarray:
     """A quick picture (size, size, 3) uint8 of the surface as φ has it now."""
     uv, faces = _fine(surface)
-    points = evaluate(phi, uv)
-    grey = np.broadcast_to(_GREY, points.shape)
-    return np.round(255 * View(surface.vertices, size).draw(points, faces, grey)).astype(np.uint8)
+    picture = View(surface.vertices, size).draw(evaluate(phi, uv), faces, _grey)
+    return np.round(255 * picture).astype(np.uint8)
+
+
+def _grey(blend: Blend) -> np.ndarray:
+    return _GREY
 
 
 def _fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,11 @@ seconds and sort them wrongly; training wants a picture now and then in a fracti
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+
+Blend = Callable[[np.ndarray], np.ndarray]
 
 _SUPERSAMPLING = 2
 _CHUNK = 4_000_000  # pixel tests at once
@@ -22,8 +26,8 @@ def view_frame(vertices: np.ndarray) -> np.ndarray:
     extent = np.ptp(vertices, axis=0)
     if extent[2] < 0.25 * extent[:2].min():
         tilt = np.radians(50)
-        up, towards = [0, np.sin(tilt), np.cos(tilt)], [0, -np.cos(tilt), np.sin(tilt)]
-        return np.array([[1, 0, 0], up, towards], dtype=np.float64)
+        sine, cosine = float(np.sin(tilt)), float(np.cos(tilt))
+        return np.array([[1.0, 0.0, 0.0], [0.0, sine, cosine], [0.0, -cosine, sine]])
     vertical = np.array([0.0, 1.0, 0.0])
     front = np.array([0.0, 0.0, 1.0]) if extent[2] <= extent[0] else np.array([1.0, 0.0, 0.0])
     towards = front + 0.5 * np.cross(vertical, front) + 0.3 * vertical
@@ -49,11 +53,14 @@ def rasterise(
         coordinates (P, 3).
     """
     corners, z = xy[faces], depth[faces]
-    low = np.floor(corners.min(axis=1)).astype(np.int64)
-    span = (np.ceil(corners.max(axis=1)).astype(np.int64) - low).max(axis=1) + 1
-    visible = np.isfinite(corners).all(axis=(1, 2)) & (span <= 4 * size)
-    side = 2 ** np.ceil(np.log2(np.maximum(span, 1))).astype(np.int64)
-    hits: list[tuple[np.ndarray, ...]] = []
+    # what is not finite or far larger than the picture is left out
+    visible = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < 4 * size).all(axis=(1, 2))
+    kept = np.where(visible[:, None, None], corners, 0.0)
+    low = np.floor(kept.min(axis=1)).astype(np.int64)
+    span = (np.ceil(kept.max(axis=1)).astype(np.int64) - low).max(axis=1) + 1
+    side = 2 ** np.ceil(np.log2(span)).astype(np.int64)
+    nothing = np.zeros(0, dtype=np.int64)
+    hits: list[tuple[np.ndarray, ...]] = [(nothing, np.zeros(0), nothing, np.zeros((0, 3)))]
     for width in np.unique(side[visible]):
         group = np.flatnonzero(visible & (side == width))
         step = np.stack(np.meshgrid(np.arange(width), np.arange(width)), axis=-1).reshape(-1, 2)
@@ -111,17 +118,15 @@ class View:
         self.size = size
 
     def draw(
-        self, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, *, uv=None
+        self, vertices: np.ndarray, faces: np.ndarray, colours: Callable[[Blend], np.ndarray]
     ) -> np.ndarray:
         """A shaded picture (size, size, 3) in [0, 1] on white.
 
         Args:
             vertices, faces: the mesh (V, 3), (F, 3).
-            colours: (V, 3) in [0, 1], interpolated; None: those of the checkerboard at ``uv``.
-            uv: (V, 2), for the checkerboard.
+            colours: gives the colours (P, 3) in [0, 1] of the pixels, from a function that
+                interpolates vertex values (V, k) to them, (P, k).
         """
-        from nsm.results.textures import checkerboard_at
-
         fine = self.size * _SUPERSAMPLING
         turned = vertices @ self.frame.T
         flat = (turned[:, :2] - self.center[:2]) / self.half
@@ -132,7 +137,7 @@ class View:
         def blend(values: np.ndarray) -> np.ndarray:
             return (weights[:, :, None] * values[corners]).sum(axis=1)
 
-        base = blend(colours) if colours is not None else checkerboard_at(blend(uv))
+        base = colours(blend)
         normal = blend(_vertex_normals(turned, faces))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
         facing = np.where(normal[:, 2:] < 0, -normal, normal)

@@ -46,7 +46,7 @@ def brain() -> Mesh:
         raise NsmError("nibabel is not installed; pip install nsm[brain]")
     import nibabel
 
-    points, triangles = nibabel.load(file).agg_data(("pointset", "triangle"))
+    points, triangles = nibabel.load(file).agg_data(("pointset", "triangle"))  # type: ignore[attr-defined]
     return np.asarray(points, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
 
 

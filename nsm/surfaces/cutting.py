@@ -222,8 +222,9 @@ def _open_handles(
     weight = 1.0 + loop_length.max() - loop_length[crossing[keep]]
     dual = csr_matrix((weight, (low[keep], high[keep])), shape=(n_faces, n_faces))
     tree = minimum_spanning_tree(dual).tocoo()
-    crossed_pairs = set((np.minimum(tree.row, tree.col) * n_faces
-                         + np.maximum(tree.row, tree.col)).tolist())
+    crossed_pairs = set(
+        (np.minimum(tree.row, tree.col) * n_faces + np.maximum(tree.row, tree.col)).tolist()
+    )
     crossed = {
         int(e)
         for e, a, b in zip(crossing[keep], low[keep], high[keep], strict=True)
@@ -238,9 +239,7 @@ def _open_handles(
     return result
 
 
-def split_chords(
-    vertices: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, int]:
+def split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Put a vertex in the middle of each inner edge that joins two boundary vertices.
 
     Flattened onto a side of the square such an edge would fold its triangles to nothing, and

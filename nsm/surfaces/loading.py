@@ -81,9 +81,7 @@ def _fan(polygons: Iterable[Sequence[int]]) -> tuple[np.ndarray, int]:
             if frozenset((ring[0], ring[2])) in taken:
                 ring.append(ring.pop(0))
             taken.update(frozenset((ring[0], corner)) for corner in ring[2:-1])
-    triangles = [
-        (ring[0], ring[i], ring[i + 1]) for ring in rings for i in range(1, len(ring) - 1)
-    ]
+    triangles = [(ring[0], ring[i], ring[i + 1]) for ring in rings for i in range(1, len(ring) - 1)]
     return np.array(triangles, dtype=np.int64).reshape(-1, 3), len(larger)
 
 

@@ -402,9 +402,9 @@ def _move(
         angle = np.arctan2(uv[moving, 1], uv[moving, 0]) + along
         moved[moving] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     else:
-        moved[moving] = (
-            uv[moving] + along[:, None] * _tangents(uv[moving], domain)
-        ).clip(-1.0, 1.0)
+        moved[moving] = (uv[moving] + along[:, None] * _tangents(uv[moving], domain)).clip(
+            -1.0, 1.0
+        )
     return moved
 
 
@@ -464,13 +464,16 @@ def symmetric_dirichlet_per_face(
     space = np.stack([vertices[b] - vertices[a], vertices[c] - vertices[a]], axis=2)
     determinant = flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.stack(
-            [
-                np.stack([flat[:, 1, 1], -flat[:, 0, 1]], axis=1),
-                np.stack([-flat[:, 1, 0], flat[:, 0, 0]], axis=1),
-            ],
-            axis=1,
-        ) / determinant[:, None, None]
+        inverse = (
+            np.stack(
+                [
+                    np.stack([flat[:, 1, 1], -flat[:, 0, 1]], axis=1),
+                    np.stack([-flat[:, 1, 0], flat[:, 0, 0]], axis=1),
+                ],
+                axis=1,
+            )
+            / determinant[:, None, None]
+        )
         jacobian = space @ inverse
         metric = np.swapaxes(jacobian, 1, 2) @ jacobian
         trace = metric[:, 0, 0] + metric[:, 1, 1]

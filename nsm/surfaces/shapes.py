@@ -103,7 +103,8 @@ def cylinder(around: int = 64, along: int = 31) -> Mesh:
 def torus(around: int = 64, across: int = 32, tube: float = 0.4) -> Mesh:
     """A torus about the z axis: the tube of the given radius runs along the unit circle."""
     small, large = np.meshgrid(
-        2 * np.pi * np.arange(across) / across, 2 * np.pi * np.arange(around) / around,
+        2 * np.pi * np.arange(across) / across,
+        2 * np.pi * np.arange(around) / around,
         indexing="ij",
     )
     reach = 1.0 + tube * np.cos(small)

@@ -75,9 +75,7 @@ def cut_along(faces: np.ndarray, is_cut: np.ndarray) -> tuple[np.ndarray, np.nda
     i, j = pairs.T
     same = flat[i] == flat[j]
     a = np.concatenate([i, following[:, 0]])
-    b = np.concatenate(
-        [np.where(same, j, following[:, 1]), np.where(same, following[:, 1], j)]
-    )
+    b = np.concatenate([np.where(same, j, following[:, 1]), np.where(same, following[:, 1], j)])
     n = faces.size
     graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
     count, label = connected_components(graph, directed=False)

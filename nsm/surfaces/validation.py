@@ -90,9 +90,12 @@ def _merge_coincident(
     joined = representative[faces]
     joined = joined[_distinct_corners(joined)]
     joined = joined[_first_uses(joined)]
-    if len(joined) and topology.edges_of(joined).count.max() > 2 >= topology.edges_of(
-        faces[_distinct_corners(faces)]
-    ).count.max():
+    if (
+        len(joined)
+        and topology.edges_of(joined).count.max()
+        > 2
+        >= topology.edges_of(faces[_distinct_corners(faces)]).count.max()
+    ):
         log.append(
             f"{duplicates} coincident vertices left apart: joined, edges would have three faces"
         )
@@ -185,9 +188,7 @@ def _keep_main_part(
             f"{name}: {count} separate parts ({listed} of the area); "
             "keep one of them, or join them, in a mesh editor"
         )
-    log.append(
-        f"{count - 1} small separate parts dropped ({100 * others.sum():.2f} % of the area)"
-    )
+    log.append(f"{count - 1} small separate parts dropped ({100 * others.sum():.2f} % of the area)")
     return faces[label == main]
 
 
@@ -207,9 +208,7 @@ def _orient(faces: np.ndarray, name: str, log: list[str]) -> np.ndarray:
     graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(2 * n, 2 * n)).tocsr()
     label = connected_components(graph, directed=False)[1]
     if (label[:n] == label[n:]).any():
-        raise NsmError(
-            f"{name}: one-sided (non-orientable) surface; cut it open in a mesh editor"
-        )
+        raise NsmError(f"{name}: one-sided (non-orientable) surface; cut it open in a mesh editor")
     turned = np.zeros(n, dtype=bool)
     done = np.zeros(n, dtype=bool)
     while not done.all():

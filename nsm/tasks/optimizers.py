@@ -47,9 +47,7 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
         raise ValueError(f"optimizer {name!r}: {error}") from error
 
 
-def build_scheduler(
-    optimizer: Optimizer, settings: dict[str, Any], max_steps: int
-) -> LRScheduler:
+def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: int) -> LRScheduler:
     """A schedule stepped after each training step.
 
     ``constant``; ``cosine``: one half-wave down to ``final`` of the rate at ``max_steps``;

@@ -30,7 +30,9 @@ def randomised(config: dict) -> torch.nn.Module:
 
 @pytest.mark.parametrize("block", BLOCKS)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-@pytest.mark.parametrize("encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}")
+@pytest.mark.parametrize(
+    "encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}"
+)
 def test_agrees_with_jacfwd(block, activation, encoding):
     config = {"width": 16, "depth": 2, "block": block, "encoding": encoding}
     net = randomised({**config, "activation": {"name": activation}})
@@ -43,7 +45,9 @@ def test_agrees_with_jacfwd(block, activation, encoding):
     assert ((jacobian - expected).abs().max() / scale) < 1e-10
 
 
-@pytest.mark.parametrize("encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}")
+@pytest.mark.parametrize(
+    "encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}"
+)
 def test_parameter_gradient_of_a_jacobian_loss(encoding):
     net = randomised({"width": 8, "depth": 1, "encoding": encoding})
     x = points(6)
@@ -66,7 +70,16 @@ def test_parameter_gradient_of_a_jacobian_loss(encoding):
 @pytest.mark.parametrize("degree", [2, 3])
 def test_spline_grid_is_smooth_across_cells(degree):
     net = randomised(
-        {"width": 8, "depth": 1, "encoding": {"name": "spline_grid", "resolutions": [4], "degree": degree, "extent": 1.0}}
+        {
+            "width": 8,
+            "depth": 1,
+            "encoding": {
+                "name": "spline_grid",
+                "resolutions": [4],
+                "degree": degree,
+                "extent": 1.0,
+            },
+        }
     )
     wall = torch.tensor([[0.5, 0.2]], dtype=torch.float64)  # a boundary between two cells
     offset = torch.tensor([[1e-9, 0.0]], dtype=torch.float64)
@@ -85,7 +98,13 @@ def test_pre_activation_blocks_begin_as_identity():
 def test_siren_keeps_its_spread_with_depth():
     torch.manual_seed(0)
     net = build_map(
-        {"width": 256, "depth": 6, "block": "plain", "activation": {"name": "sine"}, "initialisation": "siren"}
+        {
+            "width": 256,
+            "depth": 6,
+            "block": "plain",
+            "activation": {"name": "sine"},
+            "initialisation": "siren",
+        }
     )
     y = net.activation(net.input(points(2000).float()))
     for block in net.blocks:

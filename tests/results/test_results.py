@@ -1,0 +1,279 @@
+"""Figures against closed forms, artefacts against damage, exports and pictures read back."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from torch import nn
+
+from nsm.errors import NsmError
+from nsm.maps import build_map
+from nsm.results import (
+    NeuralSurface,
+    atomic_write,
+    checkerboard,
+    checkerboard_picture,
+    error_picture,
+    export_mesh,
+    load_surface,
+    overfit_metrics,
+    reconstruction_image,
+    save_surface,
+)
+from nsm.results.render import View, rasterise
+from nsm.surfaces import Surface
+
+
+class Affine(nn.Module):
+    """(u, v) to offset + u a + v b: a surface whose distances to a plane are known."""
+
+    def __init__(self, a, b, offset):
+        super().__init__()
+        frame = np.stack([a, b], axis=1)
+        self.frame = nn.Parameter(torch.tensor(frame, dtype=torch.float64))
+        self.offset = nn.Parameter(torch.tensor(offset, dtype=torch.float64))
+
+    def forward(self, uv):
+        return uv @ self.frame.T + self.offset
+
+    def value_and_jacobian(self, uv):
+        return self(uv), self.frame.expand(len(uv), 3, 2)
+
+
+def square(twins=()) -> Surface:
+    """[-1, 1]² in the plane z = 0, with its own coordinates as uv."""
+    n = 6
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
+    uv = np.stack([x.ravel(), y.ravel()], axis=1)
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
+    return Surface(
+        name="square",
+        vertices=np.column_stack([uv, np.zeros(len(uv))]),
+        faces=faces,
+        uv=uv,
+        domain="square",
+        source_vertex=np.arange(len(uv)),
+        twins=np.array(twins, dtype=np.int64).reshape(-1, 2),
+        scale=1.0,
+        center=np.zeros(3),
+    )
+
+
+DIAGONAL = np.sqrt(8)
+
+
+def test_a_perfect_map_has_no_error():
+    figures = overfit_metrics(square(), Affine([1, 0, 0], [0, 1, 0], [0, 0, 0]), samples=2000)
+    assert all(value == pytest.approx(0, abs=1e-6) for value in figures.values())
+
+
+def test_a_shift_is_measured_exactly():
+    figures = overfit_metrics(square(), Affine([1, 0, 0], [0, 1, 0], [0, 0, 0.1]), samples=2000)
+    for key in (
+        "rms_percent",
+        "max_percent",
+        "hausdorff_mesh_to_phi_percent",
+        "hausdorff_phi_to_mesh_percent",
+    ):
+        assert figures[key] == pytest.approx(10 / DIAGONAL, rel=1e-6), key
+    assert figures["normal_error_mean_degrees"] == pytest.approx(0, abs=1e-5)
+
+
+def test_rms_of_a_stretch_is_the_closed_form():
+    # φ = (1.1 u, v, 0): squared distance 0.01 u², whose mean over the square is 0.01 / 3
+    figures = overfit_metrics(square(), Affine([1.1, 0, 0], [0, 1, 0], [0, 0, 0]), samples=200_000)
+    assert figures["rms_percent"] == pytest.approx(100 * np.sqrt(0.01 / 3) / DIAGONAL, rel=0.01)
+    assert figures["hausdorff_phi_to_mesh_percent"] == pytest.approx(10 / DIAGONAL, rel=1e-6)
+    assert figures["hausdorff_mesh_to_phi_percent"] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_tilt_is_the_angle_between_normals():
+    tilt = np.radians(30)
+    phi = Affine([np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [0, 0, 0])
+    figures = overfit_metrics(square(), phi, samples=2000)
+    assert figures["normal_error_mean_degrees"] == pytest.approx(30, abs=1e-6)
+    assert figures["normal_error_p95_degrees"] == pytest.approx(30, abs=1e-6)
+
+
+def test_a_collapsed_map_is_degenerate_everywhere():
+    figures = overfit_metrics(square(), Affine([1, 0, 0], [1, 0, 0], [0, 0, 0]), samples=2000)
+    assert figures["degenerate_triangles_percent"] == 100
+
+
+def test_the_seam_gap_is_the_distance_of_twins():
+    surface = square(twins=[(0, 5)])  # (-1, -1) and (-1, 1): 2 apart
+    figures = overfit_metrics(surface, Affine([1, 0, 0], [0, 1, 0], [0, 0, 0]), samples=100)
+    assert figures["seam_gap_percent"] == pytest.approx(200 / DIAGONAL)
+
+
+@pytest.fixture
+def neural() -> NeuralSurface:
+    torch.manual_seed(0)
+    network = build_map({"width": 16, "depth": 1, "encoding": {"name": "fourier", "features": 8}})
+    return NeuralSurface(square([(0, 5)]), network, {"rms_percent": 1.5}, {"seed": 3})
+
+
+def test_saved_and_loaded_is_the_same(neural, tmp_path):
+    save_surface(tmp_path, neural)
+    again = load_surface(tmp_path)
+    uv = torch.rand(10, 2)
+    assert torch.equal(neural.map(uv), again.map(uv))
+    for name in ("vertices", "faces", "uv", "twins", "source_vertex", "center"):
+        assert np.array_equal(getattr(neural.surface, name), getattr(again.surface, name))
+    assert again.metrics == neural.metrics
+    assert again.config == neural.config
+    assert not any(p.requires_grad for p in again.map.parameters())
+    by_file = load_surface(tmp_path / "surface.safetensors")
+    assert torch.equal(neural.map(uv), by_file.map(uv))
+
+
+def test_original_units_come_back(neural):
+    surface = neural.surface
+    points = (surface.vertices / surface.scale) + surface.center
+    assert np.allclose(neural.in_original_units(surface.vertices), points)
+
+
+def truncate(folder):
+    file = folder / "surface.safetensors"
+    file.write_bytes(file.read_bytes()[:200])
+
+
+def flip_a_byte(folder):
+    file = folder / "surface.safetensors"
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(bytes(data))
+
+
+def other_version(folder):
+    file = folder / "surface.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "version": 99}))
+
+
+def other_format(folder):
+    (folder / "surface.json").write_text('{"hello": 1}')
+
+
+def not_json(folder):
+    (folder / "surface.json").write_text("{")
+
+
+def without_map(folder):
+    file = folder / "surface.json"
+    words = json.loads(file.read_text())
+    del words["map"]
+    file.write_text(json.dumps(words))
+
+
+def other_network(folder):
+    file = folder / "surface.json"
+    words = json.loads(file.read_text())
+    words["map"]["width"] = 17
+    file.write_text(json.dumps(words))
+
+
+def gone(folder):
+    (folder / "surface.safetensors").unlink()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        truncate,
+        flip_a_byte,
+        other_version,
+        other_format,
+        not_json,
+        without_map,
+        other_network,
+        gone,
+    ],
+)
+def test_a_damaged_artefact_is_told_in_one_line(neural, tmp_path, damage):
+    save_surface(tmp_path, neural)
+    damage(tmp_path)
+    with pytest.raises(NsmError) as error:
+        load_surface(tmp_path)
+    assert "\n" not in str(error.value)
+    assert str(tmp_path) in str(error.value)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    file = tmp_path / "figures.json"
+    atomic_write(file, b"old")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        atomic_write(file, b"new")
+    assert file.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("ending", [".obj", ".glb"])
+def test_exported_meshes_carry_uv(tmp_path, ending):
+    surface = square()
+    texture = checkerboard(64)
+    export_mesh(
+        tmp_path / f"mesh{ending}", surface.vertices, surface.faces, surface.uv, texture=texture
+    )
+    mesh = trimesh.load(tmp_path / f"mesh{ending}", process=False, force="mesh")
+    assert np.allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    assert np.array_equal(mesh.faces, surface.faces)
+    assert np.allclose(mesh.visual.uv, 0.5 * (surface.uv + 1), atol=1e-6)
+
+
+def test_unknown_mesh_ending_is_refused(tmp_path):
+    surface = square()
+    with pytest.raises(NsmError, match="obj or .glb"):
+        export_mesh(tmp_path / "mesh.fbx", surface.vertices, surface.faces, surface.uv)
+
+
+def test_the_rasteriser_agrees_with_the_plane():
+    """Two crossing triangles: at each pixel the nearer one, with the right barycentrics."""
+    xy = np.array([[2, 2], [60, 2], [2, 60], [2, 2], [60, 2], [2, 60]], dtype=float) + 0.25
+    depth = np.array([0, 1, 0, 0.5, 0, 0.5])
+    faces = np.array([[0, 1, 2], [3, 4, 5]])
+    pixel, face, weights = rasterise(xy, depth, faces, 64)
+    assert len(np.unique(pixel)) == len(pixel)
+    x, y = pixel % 64 + 0.5, pixel // 64 + 0.5
+    at = (weights[:, :, None] * xy[faces[face]]).sum(axis=1)
+    assert np.allclose(at, np.stack([x, y], axis=1))
+    s = (x - 2.25) / 58  # depths s and (1 - s) / 2 are equal at a third
+    clear = np.abs(s - 1 / 3) > 1e-9
+    assert np.array_equal(face[clear], (s < 1 / 3).astype(int)[clear])
+    # half of a square of 58 pixels
+    assert len(pixel) == pytest.approx(58 * 58 / 2, rel=0.03)
+
+
+def test_a_drawn_square_fills_its_share_of_the_picture():
+    surface = square()
+    picture = View(surface.vertices, 128).draw(
+        surface.vertices, surface.faces, lambda blend: np.zeros(3)
+    )
+    covered = (picture < 0.99).all(axis=2).mean()
+    # 1 / 1.06 wide, and as much lower as the slanted view makes it
+    assert covered == pytest.approx(np.sin(np.radians(50)) / 1.06**2, rel=0.03)
+
+
+def test_pictures_are_not_blank(neural, tmp_path):
+    error_picture(tmp_path / "error.png", neural.surface, neural)
+    checkerboard_picture(tmp_path / "checkerboard.png", neural.surface, neural)
+    for name in ("error.png", "checkerboard.png"):
+        assert np.asarray(Image.open(tmp_path / name)).std() > 10
+    quick = reconstruction_image(neural.surface, neural.map, size=96)
+    assert quick.shape == (96, 96, 3)
+    assert quick.dtype == np.uint8
+
+
+def test_pictures_survive_a_map_that_is_not_a_number(neural, tmp_path):
+    with torch.no_grad():
+        for parameter in neural.map.parameters():
+            parameter.fill_(float("nan"))
+    assert (reconstruction_image(neural.surface, neural.map, size=32) == 255).all()
