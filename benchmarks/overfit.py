@@ -24,7 +24,6 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import Callback
 from rich.console import Console
-from rich.table import Table
 
 from nsm.config import compose_config
 from nsm.data import OverfitData
@@ -144,22 +143,25 @@ def _store(entry: str, value: dict[str, Any], output: Path) -> None:
     atomic_write(output, (json.dumps(results, indent=1) + "\n").encode())
 
 
-def _table(output: Path) -> Table:
+def _table(output: Path) -> str:
+    """RMS in percent of the diagonal and mean normal error, as a Markdown table."""
     runs = json.loads(output.read_text())["runs"]
-    table = Table("surface", "settings", "minutes", "RMS %", "max %", "normal °", "steps")
-    for key, run in runs.items():
-        name, settings, minutes = key.split("/")
-        m = run["metrics"]
-        table.add_row(
-            name,
-            settings,
-            minutes,
-            f"{m['rms_percent']:.3f}",
-            f"{m['max_percent']:.2f}",
-            f"{m['normal_error_mean_degrees']:.2f}",
-            str(run["steps"]),
-        )
-    return table
+    columns = sorted({tuple(key.split("/")[1:]) for key in runs}, key=lambda c: (c[0], float(c[1])))
+    lines = [
+        "| surface | " + " | ".join(f"{settings}, {m} min" for settings, m in columns) + " |",
+        "|---" * (len(columns) + 1) + "|",
+    ]
+    for name in MESHES:
+        cells = []
+        for settings, minutes in columns:
+            metrics = runs.get(f"{name}/{settings}/{minutes}", {}).get("metrics")
+            cells.append(
+                f"{metrics['rms_percent']:.3f} % / {metrics['normal_error_mean_degrees']:.1f}°"
+                if metrics
+                else "not run"
+            )
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -191,7 +193,9 @@ def main() -> None:
                 for m, run in _paper(surface_of(name), sorted(arguments.minutes)).items():
                     _store(f"{name}/paper/{m:g}", run, arguments.output)
                 console.print(f"{name}/paper")
-    console.print(_table(arguments.output))
+    table = _table(arguments.output)
+    arguments.output.with_suffix(".md").write_text(table)
+    print(table)
 
 
 if __name__ == "__main__":

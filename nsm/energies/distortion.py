@@ -13,7 +13,8 @@ Values and gradients are finite for all finite metrics of float32 range:
   scores as the worst, not as a conformal one;
 * values saturate at 1e30, gradients at 1e18 per entry (:mod:`nsm.energies.numerics`).
 
-Maps with σ above 1e-3 and σ₁/σ₂ below 1e3 are altered by less than 1e-6 of their value.
+Maps with σ above 1e-2 and σ₁/σ₂ below 1e3, of source metrics above 1e-6, are altered by less
+than 1e-6 of their value.
 
 A metric does not know orientation: a map and its mirror image have one distortion. In the plane,
 where a fold is the sign of det J_h, keeping that sign is the work of

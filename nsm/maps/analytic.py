@@ -456,9 +456,7 @@ class Graph(AnalyticSurface):
         try:
             super().__init__(area, z=str(z))
         except (ArithmeticError, ValueError):
-            raise NsmError(
-                f"graph {z!r}: one of its constants is not finite, or too large"
-            ) from None
+            raise NsmError(f"graph {z!r}: a constant is not finite, or too large") from None
 
     def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
         one, zero = torch.ones_like(u), torch.zeros_like(u)

@@ -143,7 +143,9 @@ class SplineGrid(nn.Module):
         return self.value_and_jacobian_stack(x)[0]
 
 
-ENCODINGS = {
+Encoding = Identity | RandomFourierFeatures | SplineGrid
+
+ENCODINGS: dict[str, type[Encoding]] = {
     "identity": Identity,
     "fourier": RandomFourierFeatures,
     "spline_grid": SplineGrid,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from nsm.maps.activations import Activation
-from nsm.maps.encodings import ENCODINGS
+from nsm.maps.encodings import ENCODINGS, Encoding
 
 
 def _push_linear(layer: nn.Linear, s: Tensor) -> Tensor:
@@ -64,7 +64,12 @@ class DenseBlock(nn.Module):
         return self.activation.push(_push_linear(self.linear, s))
 
 
-BLOCKS = {"plain": DenseBlock, "post": PostActivationBlock, "pre": PreActivationBlock}
+Block = DenseBlock | PostActivationBlock | PreActivationBlock
+BLOCKS: dict[str, type[Block]] = {
+    "plain": DenseBlock,
+    "post": PostActivationBlock,
+    "pre": PreActivationBlock,
+}
 INITIALISATIONS = ("xavier", "kaiming", "siren")
 
 
@@ -158,7 +163,7 @@ class NeuralMap(nn.Module):
         if self._opens_with_activation:
             s = self.activation.push(s)
         for block in self.blocks:
-            s = block.push(s)
+            s = cast(Block, block).push(s)
         if not self._opens_with_activation:
             s = self.activation.push(s)
         s = _push_linear(self.output, s)

@@ -106,3 +106,9 @@ class Pictures(Callback):
         self.taken = due
         image = reconstruction_image(self.surface, pl_module, size=384)
         board.experiment.add_image("surface", image, trainer.global_step, dataformats="HWC")
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"taken": self.taken}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.taken = state_dict["taken"]

@@ -22,12 +22,12 @@ def grid_faces(
     last vertices to its first. Diagonals alternate, so that no direction is preferred and, with
     odd vertex counts, no triangle of a corner has two sides on the boundary.
     """
-    i, j = np.meshgrid(
+    cells = np.meshgrid(
         np.arange(rows if wrap_rows else rows - 1),
         np.arange(columns if wrap_columns else columns - 1),
         indexing="ij",
     )
-    i, j = i.ravel(), j.ravel()
+    i, j = (index.ravel() for index in cells)
     below, right = (i + 1) % rows, (j + 1) % columns
     a, b = i * columns + j, i * columns + right
     c, d = below * columns + right, below * columns + j

@@ -1,0 +1,29 @@
+"""Fixtures for all tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """Tests neither read nor fill the user's cache."""
+    before = os.environ.get("NSM_CACHE")
+    os.environ["NSM_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    if before is None:
+        del os.environ["NSM_CACHE"]
+    else:
+        os.environ["NSM_CACHE"] = before
+
+
+@pytest.fixture(scope="session")
+def shared_meshes() -> Path:
+    """A folder with the classic models: NSM_MESHES, or shared/meshes beside the clone."""
+    folder = Path(
+        os.environ.get("NSM_MESHES", Path(__file__).parent.parent.parent / "shared" / "meshes")
+    )
+    if not folder.is_dir():
+        pytest.skip("no folder of classic models; set NSM_MESHES to one")
+    return folder
