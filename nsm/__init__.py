@@ -12,12 +12,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nsm.api import load, overfit
+    from nsm.api import load, overfit, parameterize
     from nsm.errors import NsmError
-    from nsm.results import NeuralSurface
+    from nsm.results import NeuralSurface, Parameterization
     from nsm.surfaces import Surface, catalogue_names
 
-__all__ = ["NeuralSurface", "NsmError", "Surface", "catalogue_names", "load", "overfit"]
+__all__ = [
+    "NeuralSurface",
+    "NsmError",
+    "Parameterization",
+    "Surface",
+    "catalogue_names",
+    "load",
+    "overfit",
+    "parameterize",
+]
 
 _HOME = {
     "NeuralSurface": "nsm.results",
@@ -25,7 +34,9 @@ _HOME = {
     "Surface": "nsm.surfaces",
     "catalogue_names": "nsm.surfaces",
     "load": "nsm.api",
+    "Parameterization": "nsm.results",
     "overfit": "nsm.api",
+    "parameterize": "nsm.api",
 }
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from nsm.config import compose_config
-from nsm.pipeline import run_overfit
-from nsm.results import NeuralSurface, load_surface
+from nsm.pipeline import run_overfit, run_param
+from nsm.results import NeuralSurface, Parameterization, load_parameterization, load_surface
 from nsm.surfaces import Surface
 
 
@@ -37,23 +40,68 @@ def overfit(
         >>> phi = nsm.overfit(nsm.Surface.load("terrain"), overrides=["experiment=quick"])
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
-    words = [*overrides, f"domain={surface.domain}"]
+    words = ["task=overfit", *overrides, f"domain={surface.domain}"]
+    with _place(folder, words, progress) as (config, place):
+        return run_overfit(config, place, surface)
+
+
+def parameterize(
+    phi: NeuralSurface,
+    *,
+    overrides: Sequence[str] = (),
+    folder: str | Path | None = None,
+    progress: bool = True,
+) -> Parameterization:
+    """Flatten a neural surface to the plane with least distortion and a free boundary.
+
+    Args:
+        phi: the neural surface.
+        overrides: settings as on the command line, e.g. ``["energy=conformal"]``.
+        folder: where to leave the run's files; without it they are not kept.
+        progress: show a progress bar.
+
+    Returns:
+        The map with its new coordinates in ``uv``, and its figures beside those of libigl's
+        methods in ``metrics``.
+
+    Raises:
+        NsmError: a setting that does not exist or cannot be used.
+
+    Examples:
+        >>> flat = nsm.parameterize(phi)
+        >>> flat.uv  # (V, 2), of the cut mesh's vertices
+    """
+    words = ["task=param", *overrides, f"domain={phi.surface.domain}"]
+    with _place(folder, words, progress) as (config, place):
+        return run_param(config, place, phi)
+
+
+@contextmanager
+def _place(
+    folder: str | Path | None, words: list[str], progress: bool
+) -> Iterator[tuple[DictConfig, Path]]:
+    """The configuration, and the run folder: a passing one, without logs, if none is given."""
     if not progress:
-        words.append("trainer.progress=false")
+        words = [*words, "trainer.progress=false"]
     if folder is not None:
-        return run_overfit(compose_config(words), Path(folder), surface=surface)
+        yield compose_config(words), Path(folder)
+        return
     with tempfile.TemporaryDirectory(prefix="nsm-") as temporary:
-        quiet = [*words, "logger=none"]
-        return run_overfit(compose_config(quiet), Path(temporary), surface=surface)
+        yield compose_config([*words, "logger=none"]), Path(temporary)
 
 
-def load(folder: str | Path) -> NeuralSurface:
+def load(folder: str | Path) -> NeuralSurface | Parameterization:
     """Give back the result of a run.
 
     Args:
         folder: the run folder, or its ``surface.safetensors``.
 
+    Returns:
+        What the run made: a neural surface, or a map with the surfaces it needs.
+
     Raises:
         NsmError: nothing there, or a file that is damaged or of another version.
     """
+    if (Path(folder) / "map.json").exists():
+        return load_parameterization(folder)
     return load_surface(folder)

@@ -25,6 +25,12 @@ class TaskSchema:
 
 
 @dataclass
+class PhiSchema:
+    path: str | None = None
+    overrides: list[str] = field(default_factory=list)
+
+
+@dataclass
 class SurfaceSchema:
     path: str | None = None
     name: str = MISSING
@@ -39,11 +45,6 @@ class MapSchema:
     depth: int = MISSING
     block: str = MISSING
     initialisation: str = MISSING
-
-
-@dataclass
-class EnergySchema:
-    lambda_normal: float = MISSING
 
 
 @dataclass
@@ -62,6 +63,7 @@ class TrainerSchema:
     stop_gradient_norm: float | None = MISSING
     stop_window: int = MISSING
     threads: int | None = MISSING
+    gradient_clip: float | None = MISSING
     progress: bool = MISSING
 
 
@@ -78,11 +80,12 @@ class Schema:
     checked by what is built from them."""
 
     task: TaskSchema = field(default_factory=TaskSchema)
+    phi: PhiSchema = field(default_factory=PhiSchema)
     surface: SurfaceSchema = field(default_factory=SurfaceSchema)
     map: MapSchema = field(default_factory=MapSchema)
     activation: dict[str, Any] = MISSING
     encoding: dict[str, Any] = MISSING
-    energy: EnergySchema = field(default_factory=EnergySchema)
+    energy: dict[str, Any] = MISSING
     data: DataSchema = field(default_factory=DataSchema)
     optimizer: dict[str, Any] = MISSING
     scheduler: dict[str, Any] = MISSING

@@ -2,22 +2,36 @@
 
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.files import atomic_write
+from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh
 from nsm.results.metrics import overfit_metrics, vertex_error
-from nsm.results.pictures import checkerboard_picture, error_picture, reconstruction_image
-from nsm.results.tables import metrics_table
+from nsm.results.parameterization import Parameterization, load_parameterization
+from nsm.results.pictures import (
+    checkerboard_picture,
+    error_picture,
+    layout_image,
+    parameterization_picture,
+    reconstruction_image,
+)
+from nsm.results.tables import comparison_table, metrics_table
 from nsm.results.textures import checkerboard
 
 __all__ = [
     "NeuralSurface",
+    "Parameterization",
     "atomic_write",
     "checkerboard",
     "checkerboard_picture",
+    "comparison_table",
     "error_picture",
     "export_mesh",
+    "layout_image",
+    "load_parameterization",
     "load_surface",
     "metrics_table",
     "overfit_metrics",
+    "parameterization_picture",
+    "planar_metrics",
     "reconstruction_image",
     "save_surface",
     "vertex_error",

@@ -1,32 +1,22 @@
-"""Neural surfaces as files: weights and arrays in safetensors, everything else in JSON.
-
-Loading executes nothing from the files: there is no pickle in them.
-"""
+"""Neural surfaces: networks that are surfaces, with the meshes they were fitted to."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-from nsm.errors import NsmError
 from nsm.maps import build_map
-from nsm.results.files import atomic_write
+from nsm.results.files import misfit, read_pair, write_pair
 from nsm.surfaces import Surface
 
 FORMAT = "nsm-surface"
 VERSION = 1
-TENSOR_FILE = "surface.safetensors"
-WORDS_FILE = "surface.json"
+STEM = "surface"
 _ARRAYS = ("vertices", "faces", "uv", "source_vertex", "twins", "center")
 
 
@@ -92,18 +82,12 @@ def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
     Raises:
         OSError: the folder cannot be written.
     """
-    target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
     surface = neural.surface
     tensors = {f"map.{key}": value.contiguous() for key, value in neural.map.state_dict().items()}
     for name in _ARRAYS:
         array = np.ascontiguousarray(getattr(surface, name))
         tensors[f"surface.{name}"] = torch.from_numpy(array.copy())
-    data = save_tensors(tensors)
     words = {
-        "format": FORMAT,
-        "version": VERSION,
-        "sha256": hashlib.sha256(data).hexdigest(),
         "map": neural.map.config,
         "surface": {
             "name": surface.name,
@@ -115,8 +99,7 @@ def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
         "metrics": neural.metrics,
         "config": neural.config,
     }
-    atomic_write(target / TENSOR_FILE, data)
-    atomic_write(target / WORDS_FILE, (json.dumps(words, indent=2) + "\n").encode())
+    write_pair(Path(folder) / STEM, FORMAT, VERSION, tensors, words)
 
 
 def load_surface(folder: str | Path) -> NeuralSurface:
@@ -126,17 +109,10 @@ def load_surface(folder: str | Path) -> NeuralSurface:
         NsmError: files that are missing, truncated, damaged, or of another version.
     """
     path = Path(folder)
-    if path.name == TENSOR_FILE:
+    if path.name == f"{STEM}.safetensors":
         path = path.parent
-    words = _read_words(path / WORDS_FILE)
-    data = _read_bytes(path / TENSOR_FILE)
-    if hashlib.sha256(data).hexdigest() != words.get("sha256"):
-        raise NsmError(
-            f"{path / TENSOR_FILE}: truncated or changed (its checksum is not the one in "
-            f"{WORDS_FILE}); run the overfit again or copy the folder again"
-        )
+    tensors, words = read_pair(path / STEM, FORMAT, VERSION)
     try:
-        tensors = load_tensors(data)
         about = words["surface"]
         arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in _ARRAYS}
         surface = Surface(
@@ -150,34 +126,7 @@ def load_surface(folder: str | Path) -> NeuralSurface:
         network = build_map(words["map"])
         network.load_state_dict({k.removeprefix("map."): v for k, v in tensors.items()})
         metrics, config = dict(words["metrics"]), dict(words["config"])
-    except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise NsmError(
-            f"{path}: the two files do not fit together ({reason}); run the overfit again"
-        ) from error
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise misfit(path / STEM, error) from error
     network.eval().requires_grad_(False)
     return NeuralSurface(surface, network, metrics, config)
-
-
-def _read_bytes(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise NsmError(
-            f"{file}: {error.strerror or 'cannot be read'}; give the folder of a complete run"
-        ) from error
-
-
-def _read_words(file: Path) -> dict[str, Any]:
-    try:
-        words = json.loads(_read_bytes(file))
-    except ValueError as error:
-        raise NsmError(f"{file}: not readable as JSON; run the overfit again") from error
-    if not isinstance(words, dict) or words.get("format") != FORMAT:
-        raise NsmError(f"{file}: not a neural surface of nsm; give the folder of an overfit run")
-    if words.get("version") != VERSION:
-        raise NsmError(
-            f"{file}: version {words.get('version')}, but this nsm reads version {VERSION}; "
-            "run the overfit again with this nsm"
-        )
-    return words

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback
@@ -14,8 +16,6 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
-from nsm.results.pictures import reconstruction_image
-from nsm.surfaces import Surface
 
 
 class AtomicCheckpoint(Callback):
@@ -87,15 +87,18 @@ class GradientWatch(Callback):
 
 
 class Pictures(Callback):
-    """Put pictures of the surface into TensorBoard, evenly spread over the run.
+    """Put pictures into TensorBoard, evenly spread over the run.
 
     Args:
-        surface: what is being learned.
+        name: of the pictures.
+        draw: from the module to a picture (H, W, 3) uint8.
         count: how many pictures in all.
     """
 
-    def __init__(self, surface: Surface, count: int) -> None:
-        self.surface, self.count, self.taken = surface, count, 0
+    def __init__(
+        self, name: str, draw: Callable[[pl.LightningModule], np.ndarray], count: int
+    ) -> None:
+        self.name, self.draw, self.count, self.taken = name, draw, count, 0
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         share = trainer.global_step / max(1, trainer.max_steps)
@@ -104,8 +107,8 @@ class Pictures(Callback):
         if due <= self.taken or not isinstance(board, TensorBoardLogger):
             return
         self.taken = due
-        image = reconstruction_image(self.surface, pl_module, size=384)
-        board.experiment.add_image("surface", image, trainer.global_step, dataformats="HWC")
+        image = self.draw(pl_module)
+        board.experiment.add_image(self.name, image, trainer.global_step, dataformats="HWC")
 
     def state_dict(self) -> dict[str, Any]:
         return {"taken": self.taken}

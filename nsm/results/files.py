@@ -1,10 +1,24 @@
-"""Writing files so that they are whole or not there at all."""
+"""Files that are whole or not there at all, and artefacts as pairs of them.
+
+An artefact is STEM.safetensors (weights and arrays) beside STEM.json (everything else, and the
+checksum of the first). Loading executes nothing from them: there is no pickle.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from nsm.errors import NsmError
 
 
 def atomic_write(path: str | Path, data: bytes) -> None:
@@ -28,3 +42,63 @@ def atomic_write(path: str | Path, data: bytes) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+def write_pair(
+    stem: Path, form: str, version: int, tensors: Mapping[str, Tensor], words: Mapping[str, Any]
+) -> None:
+    """Write an artefact; its JSON last, so that a pair with both files is complete.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    data = save(dict(tensors))
+    head = {"format": form, "version": version, "sha256": hashlib.sha256(data).hexdigest()}
+    atomic_write(stem.with_suffix(".safetensors"), data)
+    text = json.dumps({**head, **words}, indent=2) + "\n"
+    atomic_write(stem.with_suffix(".json"), text.encode())
+
+
+def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and words of an artefact.
+
+    Raises:
+        NsmError: a file that is missing, truncated, damaged, of another format or version.
+    """
+    file = stem.with_suffix(".json")
+    try:
+        words = json.loads(_read(file))
+    except ValueError as error:
+        raise NsmError(f"{file}: not readable as JSON; make the run again") from error
+    if not isinstance(words, dict) or words.get("format") != form:
+        raise NsmError(f"{file}: not of format {form}; give the folder of a run that made one")
+    if words.get("version") != version:
+        raise NsmError(
+            f"{file}: version {words.get('version')}, but this nsm reads version {version}; "
+            "make the run again with this nsm"
+        )
+    data = _read(stem.with_suffix(".safetensors"))
+    if hashlib.sha256(data).hexdigest() != words.get("sha256"):
+        raise NsmError(
+            f"{stem.with_suffix('.safetensors')}: truncated or changed (its checksum is not the "
+            f"one in {file.name}); copy the folder or make the run again"
+        )
+    try:
+        return load(data), words
+    except SafetensorError as error:
+        raise misfit(stem, error) from error
+
+
+def misfit(stem: Path, error: Exception) -> NsmError:
+    """The message for an artefact whose parts do not fit together."""
+    reason = " ".join(str(error).split())[:120]
+    return NsmError(f"{stem}: its two files do not fit together ({reason}); make the run again")
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        reason = error.strerror or "cannot be read"
+        raise NsmError(f"{file}: {reason}; give the folder of a complete run") from error

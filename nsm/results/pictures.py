@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,14 +84,41 @@ def _fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     return uv, faces
 
 
-def _panels(panels: list[tuple[np.ndarray, str]]) -> Any:
-    figure = Figure(figsize=(5.5 * len(panels) + 0.6, 5.5), dpi=120)
-    for k, (image, title) in enumerate(panels):
-        axes = figure.add_subplot(1, len(panels), k + 1)
+def parameterization_picture(
+    path: str | Path, surface: Surface, maps: Mapping[str, np.ndarray]
+) -> None:
+    """For each named map (V, 2): its checkerboard on the mesh, above its layout in the plane.
+
+    The squares have one size everywhere, so that their images show area and angle distortion.
+    """
+    view = View(surface.vertices, _PANEL)
+    above = [
+        (view.draw(surface.vertices, surface.faces, _checked(uv)), name)
+        for name, uv in maps.items()
+    ]
+    below = [(layout_image(surface, uv, size=_PANEL), "") for uv in maps.values()]
+    _save(_panels(above, below), path)
+
+
+def layout_image(surface: Surface, uv: np.ndarray, *, size: int = 384) -> np.ndarray:
+    """A map (V, 2) of the mesh as it lies in the plane, (size, size, 3) in [0, 1]."""
+    flat = np.column_stack([uv, np.zeros(len(uv))])
+    return View(flat, size, frame=np.eye(3)).draw(flat, surface.faces, _checked(uv))
+
+
+def _checked(uv: np.ndarray) -> Callable[[Blend], np.ndarray]:
+    return lambda blend: checkerboard_at(blend(uv))
+
+
+def _panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
+    columns = len(rows[0])
+    figure = Figure(figsize=(5.5 * columns + 0.6, 5.5 * len(rows)), dpi=120)
+    for k, (image, title) in enumerate(panel for row in rows for panel in row):
+        axes = figure.add_subplot(len(rows), columns, k + 1)
         axes.imshow(image, interpolation="antialiased")
         axes.set_title(title)
         axes.set_axis_off()
-    figure.subplots_adjust(left=0.01, right=0.92, top=0.93, bottom=0.01, wspace=0.02)
+    figure.subplots_adjust(left=0.01, right=0.92, top=0.93, bottom=0.01, wspace=0.02, hspace=0.02)
     return figure
 
 

@@ -29,11 +29,17 @@ class TrainingProgress(Callback):
     Args:
         console: where to write.
         title: what is being trained.
-        error_key: the logged figure that is shown as the current error, in percent.
+        key, form: the logged figure that is shown as the current error, and how.
     """
 
-    def __init__(self, console: Console, title: str, error_key: str = "val/rms_percent") -> None:
-        self.console, self.title, self.error_key = console, title, error_key
+    def __init__(
+        self,
+        console: Console,
+        title: str,
+        key: str = "val/rms_percent",
+        form: str = "error {:.3f} %",
+    ) -> None:
+        self.console, self.title, self.key, self.form = console, title, key, form
         self.bar: Progress | None = None
         self.task: TaskID | None = None
         self.started = self.shown = 0.0
@@ -72,9 +78,9 @@ class TrainingProgress(Callback):
             return
         self.shown = now
         figures = f"loss {float(outputs['loss']):.2e}"
-        error = trainer.callback_metrics.get(self.error_key)
+        error = trainer.callback_metrics.get(self.key)
         if error is not None:
-            figures += f"  error {float(error):.3f} %"
+            figures += "  " + self.form.format(float(error))
         step = trainer.global_step
         if self.bar is not None and self.task is not None:
             self.bar.update(self.task, completed=step, figures=figures)

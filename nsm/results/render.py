@@ -108,10 +108,11 @@ class View:
     Args:
         reference: vertices (V, 3) that fill the picture.
         size: side of the picture in pixels.
+        frame: rows right, up, towards the viewer (3, 3); without it, a good view.
     """
 
-    def __init__(self, reference: np.ndarray, size: int) -> None:
-        self.frame = view_frame(reference)
+    def __init__(self, reference: np.ndarray, size: int, frame: np.ndarray | None = None) -> None:
+        self.frame = view_frame(reference) if frame is None else frame
         turned = reference @ self.frame.T
         self.center = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
         self.half = 0.53 * float(np.ptp(turned[:, :2], axis=0).max())

@@ -25,3 +25,21 @@ def metrics_table(metrics: Mapping[str, float]) -> Table:
     for key, (label, unit) in _ROWS.items():
         table.add_row(label, f"{metrics[key]:.3f}", unit)
     return table
+
+
+_MAP_COLUMNS = {
+    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "singular_value_ratio_median": "σ₁/σ₂, median",
+    "area_median": "area, median",
+    "flipped_percent": "flipped %",
+    "boundary_self_intersections": "overlaps",
+}
+
+
+def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
+    """The figures of :func:`nsm.results.planar_metrics`, a row for each map."""
+    table = Table("map", *_MAP_COLUMNS.values())
+    for name, figures in metrics.items():
+        table.add_row(name, *(f"{figures[key]:.3f}" for key in _MAP_COLUMNS))
+    return table

@@ -92,12 +92,14 @@ def _fan_log(larger: int) -> list[str]:
 def _read_obj(file: Path) -> _Read:
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for line in _text(file).splitlines():
-        if line.startswith("v "):
-            vertices.append([float(word) for word in line.split()[1:4]])
-        elif line.startswith("f "):
+    text = _text(file).replace("\\\r\n", " ").replace("\\\n", " ")  # lines that are continued
+    for line in text.splitlines():
+        words = line.split("#")[0].split()
+        if words[:1] == ["v"]:
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == ["f"]:
             corners = []
-            for word in line.split("#")[0].split()[1:]:
+            for word in words[1:]:
                 index = int(word.split("/")[0])
                 if index == 0:
                     raise ValueError("a face names vertex 0, but OBJ counts from 1")

@@ -303,6 +303,7 @@ def _proxy_step(
     u[:, :, 1] *= sign[:, None]
     rotation = u @ vt
     # weights that give the proxy the gradient of s^2 + s^-2 at this point (limit 2 at s = 1)
+    # without an upper bound: cut off, the weights of needles would no longer point downhill
     near = np.abs(s - 1) < 1e-6
     weight2 = np.where(near, 4.0, (s - s**-3) / np.where(near, 1.0, s - 1)).clip(1e-8)
     w2 = np.einsum("fij,fj,fkj->fik", u, weight2, u) * area[:, None, None]

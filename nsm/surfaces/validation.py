@@ -46,7 +46,10 @@ def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanM
     log: list[str] = []
     count = len(vertices)
 
-    source, representative = _merge_coincident(vertices, faces, log)
+    representative = _merge_coincident(vertices, faces, log)
+    unreferenced = len(np.setdiff1d(representative, representative[faces]))
+    if unreferenced:
+        log.append(f"{unreferenced} unreferenced vertices removed")
     faces = _drop_bad_faces(vertices, representative[faces], name, log)
     edges = topology.edges_of(faces)
     if edges.count.max() > 2:
@@ -69,39 +72,39 @@ def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanM
         kept = np.unique(split_faces)
         split_faces = np.searchsorted(kept, split_faces)
         old = old[kept]
-    unreferenced = count - len(np.unique(source[np.isin(source, old)]))
-    if unreferenced and len(np.unique(representative)) == count:
-        log.append(f"{unreferenced} unreferenced vertices removed")
     index = np.full(count, -1, dtype=np.int64)
     index[old[::-1]] = np.arange(len(old))[::-1]  # the first copy wins
     return CleanMesh(vertices[old], split_faces, old, index[representative], tuple(log))
 
 
-def _merge_coincident(
-    vertices: np.ndarray, faces: np.ndarray, log: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Exactly coincident vertices become one, unless that would tie edges to three faces."""
+def _merge_coincident(vertices: np.ndarray, faces: np.ndarray, log: list[str]) -> np.ndarray:
+    """For each vertex (V,) the first vertex at exactly its place, or itself where none is merged.
+
+    Nothing is merged if that would tie edges to three faces which have two as they are; but
+    triangles that share no vertices at all (STL) are joined whatever comes of it.
+    """
     keep = np.arange(len(vertices))
     _, first, inverse = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     representative = first[inverse.ravel()]
     duplicates = len(vertices) - len(first)
     if duplicates == 0:
-        return keep, keep
+        return keep
     joined = representative[faces]
     joined = joined[_distinct_corners(joined)]
     joined = joined[_first_uses(joined)]
+    apart = faces[_distinct_corners(faces)]
+    soup = len(faces) > 1 and len(np.unique(faces)) == faces.size
     if (
-        len(joined)
-        and topology.edges_of(joined).count.max()
-        > 2
-        >= topology.edges_of(faces[_distinct_corners(faces)]).count.max()
+        not soup
+        and len(joined)
+        and topology.edges_of(joined).count.max() > 2 >= topology.edges_of(apart).count.max()
     ):
         log.append(
             f"{duplicates} coincident vertices left apart: joined, edges would have three faces"
         )
-        return keep, keep
+        return keep
     log.append(f"{duplicates} coincident vertices merged")
-    return keep, representative
+    return representative
 
 
 def _distinct_corners(faces: np.ndarray) -> np.ndarray:
@@ -121,19 +124,18 @@ def _drop_bad_faces(
     vertices: np.ndarray, faces: np.ndarray, name: str, log: list[str]
 ) -> np.ndarray:
     diagonal = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
+    limit = DEGENERATE_AREA * diagonal**2
     distinct = _distinct_corners(faces)
-    area = topology.face_areas(vertices, faces)
-    flat = distinct & (area <= DEGENERATE_AREA * diagonal**2)
-    if (~distinct).any():
+    if not distinct.all():
         log.append(f"{int((~distinct).sum())} faces with a repeated vertex removed")
-    if flat.all() or not (distinct & ~flat).any():
-        raise NsmError(f"{name}: every face has zero area; give a mesh that is not collapsed")
     faces = faces[distinct]
-    flat = flat[distinct]
+    flat = topology.face_areas(vertices, faces) <= limit
+    if flat.all():
+        raise NsmError(f"{name}: every face has zero area; give a mesh that is not collapsed")
     if flat.any():
         # taking a sliver out of the middle would tear a hole: only its removal by an edge flip
         # keeps the surface closed
-        faces, flipped, removed = _remove_slivers(vertices, faces, flat)
+        faces, flipped, removed = _remove_slivers(vertices, faces, flat, limit)
         if flipped:
             log.append(f"{flipped} zero-area faces removed by edge flips")
         if removed:
@@ -145,30 +147,67 @@ def _drop_bad_faces(
 
 
 def _remove_slivers(
-    vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray
+    vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray, limit: float
 ) -> tuple[np.ndarray, int, int]:
-    """Flip the longest edge of each zero-area face into its neighbour where that helps."""
+    """Flip the longest edge of each face of area <= limit into its neighbour, or drop the face.
+
+    A sliver between slivers may become flippable once its neighbour is; so they are gone through
+    until none changes. Returns the faces, how many were flipped and how many dropped.
+    """
     faces = faces.copy()
-    flipped = 0
-    dropped = np.zeros(len(faces), dtype=bool)
-    for f in np.flatnonzero(flat):
-        a, b, c = faces[f]
-        sides = [(a, b, c), (b, c, a), (c, a, b)]
-        p, q, r = max(sides, key=lambda s: float(np.linalg.norm(vertices[s[0]] - vertices[s[1]])))
-        near = np.flatnonzero(((faces == p) | (faces == q)).sum(axis=1) == 2)
-        near = near[(near != f) & ~dropped[near]]
-        if len(near) == 1 and not flat[near[0]]:
-            g = int(near[0])
-            s = int(faces[g][(faces[g] != p) & (faces[g] != q)][0])
-            new_f, new_g = np.array([r, p, s]), np.array([r, s, q])
-            area = topology.face_areas(vertices, np.stack([new_f, new_g]))
-            exists = ((faces == r) | (faces == s)).sum(axis=1).max() == 2
-            if s != r and (area > 0).all() and not exists:
-                faces[f], faces[g] = new_f, new_g
+    faces_at: dict[tuple[int, int], set[int]] = {}
+    for f, face in enumerate(faces.tolist()):
+        for edge in _sides(face):
+            faces_at.setdefault(edge, set()).add(f)
+    slivers = np.flatnonzero(flat).tolist()
+    flipped, changed = 0, True
+    while changed:
+        changed = False
+        for f in list(slivers):
+            g = _flip(vertices, faces, faces_at, f, limit)
+            if g is not None:
+                slivers = [h for h in slivers if h not in (f, g)]
                 flipped += 1
-                continue
-        dropped[f] = True
-    return faces[~dropped], flipped, int(dropped.sum())
+                changed = True
+    return np.delete(faces, slivers, axis=0), flipped, len(slivers)
+
+
+def _flip(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    faces_at: dict[tuple[int, int], set[int]],
+    f: int,
+    limit: float,
+) -> int | None:
+    """Flip the longest edge of face f in place if both new faces have area; the other face."""
+    a, b, c = faces[f].tolist()
+    p, q, r = max(
+        [(a, b, c), (b, c, a), (c, a, b)],
+        key=lambda side: float(np.linalg.norm(vertices[side[0]] - vertices[side[1]])),
+    )
+    beyond = faces_at[min(p, q), max(p, q)] - {f}
+    if len(beyond) != 1:
+        return None
+    g = beyond.pop()
+    s = next(v for v in faces[g].tolist() if v not in (p, q))
+    if s == r or faces_at.get((min(r, s), max(r, s))):
+        return None
+    pair = np.array([(r, p, s), (r, s, q)], dtype=np.int64)
+    if (topology.face_areas(vertices, pair) <= limit).any():
+        return None
+    for h, new in zip((f, g), pair, strict=True):
+        for edge in _sides(faces[h].tolist()):
+            faces_at[edge].discard(h)
+        faces[h] = new
+    for h in (f, g):
+        for edge in _sides(faces[h].tolist()):
+            faces_at.setdefault(edge, set()).add(h)
+    return g
+
+
+def _sides(face: list[int]) -> list[tuple[int, int]]:
+    a, b, c = face
+    return [(min(a, b), max(a, b)), (min(b, c), max(b, c)), (min(c, a), max(c, a))]
 
 
 def _keep_main_part(
@@ -196,7 +235,7 @@ def _orient(faces: np.ndarray, name: str, log: list[str]) -> np.ndarray:
     """Turn faces so that neighbours agree; most faces keep their side."""
     edges = topology.edges_of(faces)
     pairs = topology.adjacent_faces(edges)
-    i, j = pairs // 3 @ [1, 0], pairs // 3 @ [0, 1]
+    i, j = (pairs // 3).T  # the two faces at each inner edge
     disagree = faces.ravel()[pairs[:, 0]] == faces.ravel()[pairs[:, 1]]
     if not disagree.any():
         return faces

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -78,3 +78,14 @@ def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: i
         return rise * wave((step - start) / period)
 
     return LambdaLR(optimizer, factor)
+
+
+def configure(module: nn.Module, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What Lightning wants of ``configure_optimizers``, from a task's hyperparameters.
+
+    Raises:
+        ValueError: as :func:`build_optimizer` and :func:`build_scheduler`.
+    """
+    optimizer = build_optimizer(module, dict(settings["optimizer"]))
+    scheduler = build_scheduler(optimizer, dict(settings["scheduler"]), settings["max_steps"])
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

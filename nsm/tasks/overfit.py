@@ -11,7 +11,7 @@ from torch import Tensor
 from nsm.data import Samples
 from nsm.energies.overfit import normal, position
 from nsm.maps import build_map
-from nsm.tasks.optimizers import build_optimizer, build_scheduler
+from nsm.tasks.optimizers import configure
 
 
 class Overfit(pl.LightningModule):
@@ -24,6 +24,8 @@ class Overfit(pl.LightningModule):
         max_steps: length of the schedule.
         diagonal: of the surface's bounding box, the unit of the errors that are logged.
     """
+
+    progress_figure, progress_form = "val/rms_percent", "error {:.3f} %"
 
     def __init__(
         self,
@@ -72,11 +74,4 @@ class Overfit(pl.LightningModule):
         self.log("val/rms_percent", 100 * squared.sqrt() / self.diagonal)
 
     def configure_optimizers(self) -> Any:
-        optimizer = build_optimizer(self.map, dict(self.hparams["optimizer"]))
-        scheduler = build_scheduler(
-            optimizer, dict(self.hparams["scheduler"]), self.hparams["max_steps"]
-        )
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-        }
+        return configure(self.map, self.hparams)

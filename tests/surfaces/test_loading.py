@@ -63,7 +63,9 @@ def test_obj_faces_of_missing_vertices(tmp_path, face):
 
 def test_obj_with_tabs_indents_and_continued_lines(tmp_path):
     file = tmp_path / "odd.obj"
-    file.write_bytes(b"v\t0 0 0\r\n  v 1 0 0\r\nv 1 1 0\r\nv 0 1 0\r\nf\t1 2 \\\r\n3\r\nf 1 3 4\r\n")
+    file.write_bytes(
+        b"v\t0 0 0\r\n  v 1 0 0\r\nv 1 1 0\r\nv 0 1 0\r\nf\t1 2 \\\r\n3\r\nf 1 3 4\r\n"
+    )
     vertices, faces, _ = load_mesh(file)
     assert len(vertices) == 4
     assert np.array_equal(faces, [[0, 1, 2], [0, 2, 3]])

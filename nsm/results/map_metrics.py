@@ -1,0 +1,47 @@
+"""Quality of maps, measured on the source mesh's own triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from nsm.energies import area, singular_value_ratio, symmetric_dirichlet
+from nsm.surfaces.parameterization import boundary_self_intersections, signed_areas
+from nsm.surfaces.topology import boundary_loops, face_areas
+
+
+def triangle_metric(points: np.ndarray, faces: np.ndarray) -> torch.Tensor:
+    """EᵀE (F, 2, 2) of each triangle's edge vectors E, for points (V, 2) or (V, 3).
+
+    With A of the source and B of the image, A⁻¹B is similar to JᵀJ of the affine map between
+    them, as of Jacobians on Ω.
+    """
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    edges = torch.from_numpy(np.stack([b - a, c - a], axis=2)).double()
+    return edges.transpose(1, 2) @ edges
+
+
+def planar_metrics(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> dict[str, float]:
+    """Figures of a map of a mesh (V, 3), (F, 3) to the plane (V, 2).
+
+    Returns:
+        median, mean and p95 of symmetric_dirichlet, singular_value_ratio and area over the
+        triangles, weighted by their area on the mesh for the mean; flipped_percent, against the
+        orientation of most; boundary_self_intersections, by which a map without flips can still
+        overlap itself.
+    """
+    source, image = triangle_metric(vertices, faces), triangle_metric(uv, faces)
+    weights = face_areas(vertices, faces)
+    figures: dict[str, float] = {}
+    for energy in (symmetric_dirichlet, singular_value_ratio, area):
+        value = energy(source, image).numpy()
+        name = energy.__name__
+        figures[f"{name}_median"] = float(np.median(value))
+        figures[f"{name}_mean"] = float(np.average(value, weights=weights))
+        figures[f"{name}_p95"] = float(np.percentile(value, 95))
+    signed = signed_areas(uv, faces)
+    flipped = min(int((signed <= 0).sum()), int((signed >= 0).sum()))
+    figures["flipped_percent"] = 100 * flipped / len(faces)
+    loop = boundary_loops(faces)[0]
+    figures["boundary_self_intersections"] = float(boundary_self_intersections(uv, loop))
+    return figures

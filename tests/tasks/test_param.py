@@ -1,0 +1,203 @@
+"""Param: closed forms, libigl on the same mesh, and the command."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import nsm
+from nsm.data import SurfaceSampler
+from nsm.errors import NsmError
+from nsm.maps.planar import PlanarMap
+from nsm.results import planar_metrics
+from nsm.surfaces import Surface
+from nsm.surfaces.baselines import BASELINES
+from nsm.surfaces.catalogue import catalogue_mesh
+from nsm.tasks import Param
+
+SETTINGS = {
+    "map": {
+        "width": 16,
+        "depth": 1,
+        "block": "plain",
+        "activation": {"name": "softplus", "beta": 10.0},
+        "encoding": {"name": "identity"},
+    },
+    "optimizer": {"name": "adam", "lr": 1e-2},
+    "scheduler": {"name": "cosine"},
+    "max_steps": 300,
+    "domain": "square",
+    "weights": {"symmetric_dirichlet": 1.0},
+    "lambda_injectivity": 100.0,
+    "lambda_boundary": 1e3,
+    "boundary": "free",
+}
+
+
+class Stretched(nn.Module):
+    """The plane stretched by 2 and 1/2: an isometry undoes it."""
+
+    def __init__(self, s=2.0, t=0.5):
+        super().__init__()
+        frame = torch.tensor([[s, 0.0], [0.0, t], [0.0, 0.0]])
+        self.register_buffer("frame", frame)
+
+    def value_and_jacobian(self, x):
+        return x @ self.frame.T, self.frame.expand(len(x), 3, 2)
+
+
+@pytest.fixture(scope="module")
+def plane() -> Surface:
+    return Surface.from_arrays(*catalogue_mesh("plane"), domain="square")
+
+
+def train(module, surface, steps):
+    module.log = lambda *args, **kwargs: None
+    sampler = SurfaceSampler(surface)
+    chosen = module.configure_optimizers()
+    for step in range(steps):
+        batch = sampler.by_area(512, sampler.generator(0, step))
+        loss = module.training_step(batch, step)
+        chosen["optimizer"].zero_grad()
+        loss.backward()
+        chosen["optimizer"].step()
+        chosen["lr_scheduler"]["scheduler"].step()
+    return float(loss)
+
+
+def test_it_starts_as_the_identity():
+    torch.manual_seed(0)
+    h = PlanarMap(width=8, depth=1)
+    x = torch.rand(20, 2)
+    value, jacobian = h.value_and_jacobian(x)
+    assert torch.equal(value, x)
+    assert torch.equal(jacobian, torch.eye(2).expand(20, 2, 2))
+
+
+def test_planar_jacobian_is_that_of_autograd():
+    torch.manual_seed(0)
+    h = PlanarMap(width=8, depth=1, encoding={"name": "fourier", "features": 4}).double()
+    for parameter in h.parameters():
+        nn.init.normal_(parameter, std=0.3)
+    x = torch.rand(10, 2, dtype=torch.float64)
+    expected = torch.func.vmap(torch.func.jacfwd(lambda p: h(p[None])[0]))(x)
+    assert torch.allclose(h.value_and_jacobian(x)[1], expected, atol=1e-10)
+
+
+def test_an_isometry_is_the_minimum(plane):
+    module = Param(**SETTINGS, phi=Stretched(1.0, 1.0))
+    module.log = lambda *args, **kwargs: None
+    sampler = SurfaceSampler(plane)
+    loss = module.training_step(sampler.by_area(100, sampler.generator(0)), 0)
+    assert float(loss) == pytest.approx(2 + 2 / 1.01, rel=1e-5)
+
+
+def test_a_stretch_is_undone(plane):
+    torch.manual_seed(0)
+    module = Param(**SETTINGS, phi=Stretched())
+    loss = train(module, plane, 300)
+    assert loss == pytest.approx(2 + 2 / 1.01, rel=1e-2)
+    jacobian = module.map.value_and_jacobian(torch.rand(100, 2) - 0.5)[1]
+    sigma = torch.linalg.svdvals(jacobian @ torch.diag(torch.tensor([0.5, 2.0])))
+    assert float((sigma - 1).abs().max()) < 0.1
+    assert float(torch.linalg.det(jacobian).min()) > 0
+
+
+def test_a_fixed_boundary_stays_on_that_of_the_domain(plane):
+    torch.manual_seed(0)
+    module = Param(**{**SETTINGS, "boundary": "fixed"}, phi=Stretched())
+    train(module, plane, 300)
+    rim = module.map(module.rim)
+    assert float((rim.abs().amax(dim=1) - 1).abs().max()) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"weights": {"symetric": 1.0}}, "symmetric"), ({"boundary": "loose"}, "free")],
+)
+def test_unknown_choices_are_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        Param(**{**SETTINGS, **change}, phi=Stretched())
+
+
+def test_planar_figures_of_known_maps():
+    vertices, faces = catalogue_mesh("plane")
+    flat = vertices[:, :2]
+    same = planar_metrics(vertices, faces, flat)
+    assert same["symmetric_dirichlet_median"] == pytest.approx(2 + 2 / 1.01)
+    assert same["flipped_percent"] == 0
+    assert same["boundary_self_intersections"] == 0
+    stretched = planar_metrics(vertices, faces, flat * [3.0, 1.0])
+    assert stretched["singular_value_ratio_p95"] == pytest.approx(3)
+    assert stretched["area_mean"] == pytest.approx(4 + 4 / 9)
+    folded = flat.copy()
+    middle = int(np.linalg.norm(flat, axis=1).argmin())
+    folded[middle] += 0.2
+    assert planar_metrics(vertices, faces, folded)["flipped_percent"] > 0
+    mirrored = planar_metrics(vertices, faces, flat * [-1.0, 1.0])
+    assert mirrored["flipped_percent"] == 0
+
+
+@pytest.mark.parametrize("name", ["SLIM", "ARAP", "LSCM"])
+def test_libigl_flattens_a_bent_sheet_isometrically(name):
+    vertices, faces = catalogue_mesh("plane")
+    x, y = vertices[:, 0], vertices[:, 1]
+    bent = np.stack([np.sin(x), y, np.cos(x)], axis=1)  # part of a cylinder
+    uv = BASELINES[name](bent, faces, vertices[:, :2] * 0.8)
+    figures = planar_metrics(bent, faces, uv)
+    assert figures["symmetric_dirichlet_median"] == pytest.approx(2 + 2 / 1.01, rel=2e-3)
+    assert figures["flipped_percent"] == 0
+
+
+@pytest.fixture(scope="module")
+def phi() -> nsm.NeuralSurface:
+    surface = Surface.from_arrays(*catalogue_mesh("hemisphere"), name="hemisphere")
+    overrides = ["experiment=quick", "trainer.max_steps=300"]
+    return nsm.overfit(surface, overrides=overrides, progress=False)
+
+
+QUICK = ["trainer.max_steps=200", "data.steps_per_epoch=50", "encoding.resolutions=[4,16]"]
+
+
+def test_parameterize_lowers_distortion_and_is_given_back(phi, tmp_path):
+    flat = nsm.parameterize(phi, overrides=QUICK, folder=tmp_path, progress=False)
+    ours, start = flat.metrics["nsm"], flat.metrics["domain"]
+    assert ours["symmetric_dirichlet_mean"] < start["symmetric_dirichlet_mean"]
+    assert ours["flipped_percent"] == 0
+    assert ours["symmetric_dirichlet_median"] < (
+        1.02 * flat.metrics["SLIM (libigl)"]["symmetric_dirichlet_median"]
+    )
+    for name in ("parameterized.obj", "parameterized.glb", "checkerboard.png", "map.safetensors"):
+        assert (tmp_path / name).stat().st_size > 0
+    stored = json.loads((tmp_path / "metrics.json").read_text())
+    assert stored["metrics"] == flat.metrics
+    again = nsm.load(tmp_path)
+    assert np.array_equal(again.uv, flat.uv)
+    assert again.metrics == flat.metrics
+    (tmp_path / "map.safetensors").write_bytes(b"short")
+    with pytest.raises(NsmError, match="truncated"):
+        nsm.load(tmp_path)
+
+
+def test_the_command_makes_and_keeps_the_neural_surface(tmp_path, monkeypatch, capfd):
+    import sys
+
+    from nsm import cli
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
+    words = ["task=param", "surface=hemisphere", *QUICK, "logger=none"]
+    quick = 'phi.overrides=["experiment=quick","trainer.max_steps=100"]'
+    for attempt in ("made", "cached"):
+        monkeypatch.setattr(sys, "argv", ["nsm", *words, quick])
+        cli.main()
+        out = capfd.readouterr().out
+        assert ("from the cache" in out.split("taken")[-1]) == (attempt == "cached")
+        assert "SLIM (libigl)" in out
+    monkeypatch.setattr(sys, "argv", ["nsm", *words, "phi.path=nowhere"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert len(capfd.readouterr().err.strip().splitlines()) == 1
