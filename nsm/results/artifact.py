@@ -123,6 +123,7 @@ def load_surface(folder: str | Path) -> NeuralSurface:
             log=tuple(about["log"]),
             **arrays,
         )
+        _check_shapes(surface)
         network = build_map(words["map"])
         network.load_state_dict({k.removeprefix("map."): v for k, v in tensors.items()})
         metrics, config = dict(words["metrics"]), dict(words["config"])
@@ -130,3 +131,20 @@ def load_surface(folder: str | Path) -> NeuralSurface:
         raise misfit(path / STEM, error) from error
     network.eval().requires_grad_(False)
     return NeuralSurface(surface, network, metrics, config)
+
+
+def _check_shapes(surface: Surface) -> None:
+    """ValueError for arrays that are no surface: later work would fail far from the cause."""
+    count = len(surface.vertices)
+    expected = {"vertices": (count, 3), "uv": (count, 2), "source_vertex": (count,), "center": (3,)}
+    for name, shape in expected.items():
+        if getattr(surface, name).shape != shape:
+            raise ValueError(f"{name} is not {shape}")
+    for name, columns in (("faces", 3), ("twins", 2)):
+        index = getattr(surface, name)
+        if index.ndim != 2 or index.shape[1] != columns:
+            raise ValueError(f"{name} has not {columns} columns")
+        if index.size and not 0 <= index.min() <= index.max() < count:
+            raise ValueError(f"{name} names a vertex that is not there")
+    if surface.domain not in ("disc", "square") or not 0 < surface.scale < float("inf"):
+        raise ValueError("unknown domain or scale")

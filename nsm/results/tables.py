@@ -40,6 +40,7 @@ _MAP_COLUMNS = {
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
     """The figures of :func:`nsm.results.planar_metrics`, a row for each map."""
     table = Table("map", *_MAP_COLUMNS.values())
+    table.columns[0].no_wrap = True
     for name, figures in metrics.items():
         table.add_row(name, *(f"{figures[key]:.3f}" for key in _MAP_COLUMNS))
     return table

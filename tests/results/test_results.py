@@ -176,6 +176,13 @@ def other_network(folder):
     file.write_text(json.dumps(words))
 
 
+def other_domain(folder):
+    file = folder / "surface.json"
+    words = json.loads(file.read_text())
+    words["surface"]["domain"] = "circle"
+    file.write_text(json.dumps(words))
+
+
 def gone(folder):
     (folder / "surface.safetensors").unlink()
 
@@ -190,6 +197,7 @@ def gone(folder):
         not_json,
         without_map,
         other_network,
+        other_domain,
         gone,
     ],
 )

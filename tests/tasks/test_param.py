@@ -167,7 +167,7 @@ def test_parameterize_lowers_distortion_and_is_given_back(phi, tmp_path):
     assert ours["symmetric_dirichlet_mean"] < start["symmetric_dirichlet_mean"]
     assert ours["flipped_percent"] == 0
     assert ours["symmetric_dirichlet_median"] < (
-        1.02 * flat.metrics["SLIM (libigl)"]["symmetric_dirichlet_median"]
+        1.05 * flat.metrics["SLIM (libigl)"]["symmetric_dirichlet_median"]
     )
     for name in ("parameterized.obj", "parameterized.glb", "checkerboard.png", "map.safetensors"):
         assert (tmp_path / name).stat().st_size > 0
@@ -194,7 +194,7 @@ def test_the_command_makes_and_keeps_the_neural_surface(tmp_path, monkeypatch, c
         monkeypatch.setattr(sys, "argv", ["nsm", *words, quick])
         cli.main()
         out = capfd.readouterr().out
-        assert ("from the cache" in out.split("taken")[-1]) == (attempt == "cached")
+        assert ("neural surface taken from the cache" in out) == (attempt == "cached")
         assert "SLIM (libigl)" in out
     monkeypatch.setattr(sys, "argv", ["nsm", *words, "phi.path=nowhere"])
     with pytest.raises(SystemExit) as stop:
