@@ -43,7 +43,7 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     figure = _panels([(source, f"{surface.name}: mesh"), (image, title)])
     figure.colorbar(
         scale,
-        cax=figure.add_axes((0.94, 0.2, 0.012, 0.6)),
+        cax=figure.add_axes((0.91, 0.2, 0.012, 0.6)),
         label="distance, % of the diagonal",
         extend="max",
     )
@@ -118,7 +118,7 @@ def _panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
         axes.imshow(image, interpolation="antialiased")
         axes.set_title(title)
         axes.set_axis_off()
-    figure.subplots_adjust(left=0.01, right=0.92, top=0.93, bottom=0.01, wspace=0.02, hspace=0.02)
+    figure.subplots_adjust(left=0.01, right=0.9, top=0.93, bottom=0.01, wspace=0.02, hspace=0.02)
     return figure
 
 
