@@ -58,7 +58,7 @@ class _Clock(Callback):
         spent = time.process_time() - self.start - self.aside
         while self.marks and spent >= self.marks[0]:
             before = time.process_time()
-            self.at_mark(self.marks.pop(0), trainer.global_step)
+            self.at_mark(pl_module, self.marks.pop(0), trainer.global_step)
             self.aside += time.process_time() - before
         trainer.should_stop = trainer.should_stop or not self.marks
 
@@ -101,24 +101,19 @@ def _default(surface: Surface, minutes: float) -> dict[str, Any]:
 def _paper(surface: Surface, minutes: list[float]) -> dict[float, dict[str, Any]]:
     config = compose_config(["experiment=paper"])
     found: dict[float, dict[str, Any]] = {}
-    holder: list[Any] = []
 
-    class _Hold(Callback):
-        def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-            holder.append(pl_module)
-
-    def at_mark(seconds: float, step: int) -> None:
+    def at_mark(module: Any, seconds: float, step: int) -> None:
         found[seconds / 60] = {
             "steps": step,
             "cpu_seconds": seconds,
-            "metrics": overfit_metrics(surface, holder[0].map.eval()),
+            "metrics": overfit_metrics(surface, module.map.eval()),
         }
-        holder[0].map.train()
+        module.map.train()
 
     settings = config.trainer
     watch = GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window)
     trainer, module, seconds = _train(
-        config, surface, [_Hold(), _Clock([60 * m for m in minutes], at_mark), watch]
+        config, surface, [_Clock([60 * m for m in minutes], at_mark), watch]
     )
     for m in minutes:  # the stopping rule came first: this is what the user has at that time
         found.setdefault(

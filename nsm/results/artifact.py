@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from nsm.maps import build_map
 from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.surfaces import Surface
 
 FORMAT = "nsm-surface"
@@ -44,8 +45,7 @@ class NeuralSurface:
         """Points (N, 2) of Ω to points (N, 3) of the surface; numpy for numpy, torch for torch."""
         if isinstance(uv, Tensor):
             return self.map(uv)
-        with torch.no_grad():
-            return self.map(self._tensor(uv)).cpu().numpy().astype(np.float64)
+        return evaluate(self.map, np.asarray(uv))
 
     @overload
     def jacobian(self, uv: np.ndarray) -> np.ndarray: ...
@@ -55,13 +55,7 @@ class NeuralSurface:
         """Jacobians (N, 3, 2) at points (N, 2) of Ω."""
         if isinstance(uv, Tensor):
             return self.map.value_and_jacobian(uv)[1]  # type: ignore[operator]
-        with torch.no_grad():
-            jacobian = self.map.value_and_jacobian(self._tensor(uv))[1]  # type: ignore[operator]
-        return jacobian.cpu().numpy().astype(np.float64)
-
-    def _tensor(self, uv: np.ndarray) -> Tensor:
-        like = next(self.map.parameters())
-        return torch.as_tensor(np.asarray(uv), dtype=like.dtype, device=like.device)
+        return evaluate_jacobian(self.map, np.asarray(uv))[1]
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2)."""

@@ -69,11 +69,8 @@ class Param(pl.LightningModule):
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
-        with torch.no_grad():
-            source = first_fundamental_form(self.phi.value_and_jacobian(batch.uv)[1])  # type: ignore[operator]
-        _, jacobian = self.map.value_and_jacobian(batch.uv)
-        distortion = self.energy(source, first_fundamental_form(jacobian)).mean()
-        fold = injectivity(torch.linalg.det(jacobian)).mean()
+        distortion, determinant = self._distortion(batch.uv)
+        fold = injectivity(determinant).mean()
         loss = distortion + self.lambda_injectivity * fold
         self.log("train/distortion", distortion)
         self.log("train/injectivity", fold)
@@ -84,11 +81,17 @@ class Param(pl.LightningModule):
         self.log("train/loss", loss)
         return loss
 
+    def _distortion(self, uv: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean energy at points (N, 2) of Ω, and det J_h (N,) there; φ's work is not recorded."""
+        with torch.no_grad():
+            source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
+        _, jacobian = self.map.value_and_jacobian(uv)
+        energy = self.energy(source, first_fundamental_form(jacobian)).mean()
+        return energy, torch.linalg.det(jacobian)
+
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        source = first_fundamental_form(self.phi.value_and_jacobian(batch.uv)[1])  # type: ignore[operator]
-        _, jacobian = self.map.value_and_jacobian(batch.uv)
-        distortion = self.energy(source, first_fundamental_form(jacobian)).mean()
-        folded = 100 * (torch.linalg.det(jacobian) <= 0).double().mean()
+        distortion, determinant = self._distortion(batch.uv)
+        folded = 100 * (determinant <= 0).double().mean()
         self.log("val/distortion", distortion, batch_size=len(batch.uv))
         self.log("val/folded_percent", folded, batch_size=len(batch.uv))
 
