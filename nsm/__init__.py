@@ -12,9 +12,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nsm.api import load, overfit, parameterize
+    from nsm.api import load, map_pair, overfit, parameterize
     from nsm.errors import NsmError
-    from nsm.results import NeuralSurface, Parameterization
+    from nsm.results import NeuralSurface, Parameterization, SurfaceMap
     from nsm.surfaces import Surface, catalogue_names
 
 __all__ = [
@@ -22,8 +22,10 @@ __all__ = [
     "NsmError",
     "Parameterization",
     "Surface",
+    "SurfaceMap",
     "catalogue_names",
     "load",
+    "map_pair",
     "overfit",
     "parameterize",
 ]
@@ -32,6 +34,8 @@ _HOME = {
     "NeuralSurface": "nsm.results",
     "NsmError": "nsm.errors",
     "Surface": "nsm.surfaces",
+    "SurfaceMap": "nsm.results",
+    "map_pair": "nsm.api",
     "catalogue_names": "nsm.surfaces",
     "load": "nsm.api",
     "Parameterization": "nsm.results",

@@ -6,12 +6,20 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
 from nsm.config import compose_config
-from nsm.pipeline import run_overfit, run_param
-from nsm.results import NeuralSurface, Parameterization, load_parameterization, load_surface
+from nsm.pipeline import run_overfit, run_pair_map, run_param
+from nsm.results import (
+    NeuralSurface,
+    Parameterization,
+    SurfaceMap,
+    load_parameterization,
+    load_surface,
+    load_surface_map,
+)
 from nsm.surfaces import Surface
 
 
@@ -76,6 +84,47 @@ def parameterize(
         return run_param(config, place, phi)
 
 
+def map_pair(
+    source: NeuralSurface | str | Path,
+    target: NeuralSurface | str | Path | dict[str, Any],
+    landmarks: Any = None,
+    *,
+    overrides: Sequence[str] = (),
+    folder: str | Path | None = None,
+    progress: bool = True,
+) -> SurfaceMap:
+    """Map one surface to another with least distortion.
+
+    Two closed meshes, given as files, are cut alike through their landmarks, which is what makes
+    a good map; neural surfaces are taken as they are.
+
+    Args:
+        source: a neural surface, the folder of one, a mesh file, or a name of the catalogue.
+        target: the same; or an analytic surface, by name or as ``{"name": ..., parameters}``.
+        landmarks: pairs ``[(i, j), ...]`` of vertices of the two mesh files, or of points (x, y,
+            z); or a JSON file of them; or two files, one for each surface.
+        overrides: settings as on the command line, e.g. ``["energy=arap"]``.
+        folder: where to leave the run's files; without it they are not kept.
+        progress: show a progress bar.
+
+    Returns:
+        The map: ``f(points)``, ``f.transfer(values)``, ``f.metrics``.
+
+    Raises:
+        NsmError: a surface, landmark or setting that cannot be used.
+
+    Examples:
+        >>> f = nsm.map_pair("cat.obj", "horse.obj", landmarks=[(5259, 2289), (3651, 5255)])
+        >>> f(points)  # (N, 3) on the cat to (N, 3) on the horse
+    """
+    words = ["task=pair_map", *overrides]
+    ready = [end for end in (source, target) if isinstance(end, NeuralSurface)]
+    if ready:
+        words.append(f"domain={ready[0].surface.domain}")
+    with _place(folder, words, progress) as (config, place):
+        return run_pair_map(config, place, source, target, landmarks)
+
+
 @contextmanager
 def _place(
     folder: str | Path | None, words: list[str], progress: bool
@@ -90,7 +139,7 @@ def _place(
         yield compose_config([*words, "logger=none"]), Path(temporary)
 
 
-def load(folder: str | Path) -> NeuralSurface | Parameterization:
+def load(folder: str | Path) -> NeuralSurface | Parameterization | SurfaceMap:
     """Give back the result of a run.
 
     Args:
@@ -102,6 +151,8 @@ def load(folder: str | Path) -> NeuralSurface | Parameterization:
     Raises:
         NsmError: nothing there, or a file that is damaged or of another version.
     """
+    if (Path(folder) / "pair.json").exists():
+        return load_surface_map(folder)
     if (Path(folder) / "map.json").exists():
         return load_parameterization(folder)
     return load_surface(folder)

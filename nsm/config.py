@@ -40,6 +40,18 @@ class SurfaceSchema:
 
 
 @dataclass
+class SeamSchema:
+    path: str = MISSING
+    landmarks: int | None = MISSING
+
+
+@dataclass
+class AttributesSchema:
+    source: str | None = None
+    target: str | None = None
+
+
+@dataclass
 class MapSchema:
     width: int = MISSING
     depth: int = MISSING
@@ -82,10 +94,16 @@ class Schema:
     task: TaskSchema = field(default_factory=TaskSchema)
     phi: PhiSchema = field(default_factory=PhiSchema)
     surface: SurfaceSchema = field(default_factory=SurfaceSchema)
+    source: Any = None
+    target: Any = None
+    landmarks: Any = None
+    attributes: AttributesSchema = field(default_factory=AttributesSchema)
+    seam: SeamSchema = field(default_factory=SeamSchema)
     map: MapSchema = field(default_factory=MapSchema)
     activation: dict[str, Any] = MISSING
     encoding: dict[str, Any] = MISSING
     energy: dict[str, Any] = MISSING
+    constraints: dict[str, Any] | None = None
     data: DataSchema = field(default_factory=DataSchema)
     optimizer: dict[str, Any] = MISSING
     scheduler: dict[str, Any] = MISSING
@@ -119,15 +137,27 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("nsm.run_folder", _run_folder, replace=True, use_cache=True)
 
 
-def _run_folder(resume: str | None, task: str, name: str, path: str | None) -> str:
+def _run_folder(
+    resume: str | None, task: str, name: str, path: str | None, source: Any, target: Any
+) -> str:
     if resume is not None:
         return str(resume)
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = f"outputs/{task}/{Path(path).stem if path else name}-{stamp}"
+    what = Path(path).stem if path else name
+    if target is not None:
+        what = "-".join(_called(end) for end in (source, target))
+    folder = f"outputs/{task}/{what}-{stamp}"
     number, free = 2, folder
     while Path(free).exists():  # runs started within the same second
         number, free = number + 1, f"{folder}-{number}"
     return free
+
+
+def _called(surface: Any) -> str:
+    """A short name for what ``source`` or ``target`` names."""
+    if isinstance(surface, (dict, DictConfig)):
+        return str(surface.get("name"))
+    return Path(str(surface)).stem
 
 
 def compose_config(overrides: Sequence[str] = ()) -> DictConfig:

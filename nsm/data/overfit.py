@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytorch_lightning as pl
 import torch
@@ -12,21 +13,21 @@ from nsm.data.sampling import Samples, SurfaceSampler
 from nsm.surfaces import Surface
 
 # Held-out points come from their own stream, whatever the training's seed.
-_HELD_OUT_SEED = 7_919
+HELD_OUT_SEED = 7_919
 
 
-class _Steps(IterableDataset[Samples]):
+class Steps(IterableDataset[Any]):
     """One epoch: the batches of consecutive steps, each a function of (seed, step)."""
 
     def __init__(
-        self, draw: Callable[[int], Samples], first_step: Callable[[], int], length: int
+        self, draw: Callable[[int], Any], first_step: Callable[[], int], length: int
     ) -> None:
         self.draw, self.first_step, self.length = draw, first_step, length
 
     def __len__(self) -> int:
         return self.length
 
-    def __iter__(self) -> Iterator[Samples]:
+    def __iter__(self) -> Iterator[Any]:
         first = self.first_step()
         for step in range(first, first + self.length):
             yield self.draw(step)
@@ -88,10 +89,10 @@ class OverfitData(pl.LightningDataModule):
     def train_dataloader(self) -> DataLoader[Samples]:
         trainer = self.trainer
         assert trainer is not None
-        steps = _Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
+        steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
         return DataLoader(steps, batch_size=None)
 
     def val_dataloader(self) -> DataLoader[Samples]:
-        samples = self.sampler.by_area(self.held_out, self.sampler.generator(_HELD_OUT_SEED))
+        samples = self.sampler.by_area(self.held_out, self.sampler.generator(HELD_OUT_SEED))
         chunks = [Samples(*parts) for parts in zip(*(p.split(8192) for p in samples), strict=True)]
         return DataLoader(chunks, batch_size=None)  # type: ignore[arg-type]

@@ -4,7 +4,9 @@ from nsm.maps.activations import ACTIVATIONS, Activation
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, build_analytic
 from nsm.maps.composition import Composition, PointMap, Rotated
 from nsm.maps.encodings import ENCODINGS, RandomFourierFeatures, SplineGrid
+from nsm.maps.inverse import Between, inverted
 from nsm.maps.networks import BLOCKS, NeuralMap, build_map
+from nsm.maps.planar import DiscMap, Planar, PlanarMap, SquareMap, build_planar
 
 __all__ = [
     "ACTIVATIONS",
@@ -12,13 +14,20 @@ __all__ = [
     "BLOCKS",
     "ENCODINGS",
     "Activation",
+    "Between",
     "AnalyticSurface",
     "Composition",
+    "DiscMap",
     "NeuralMap",
+    "Planar",
+    "PlanarMap",
     "PointMap",
     "RandomFourierFeatures",
     "Rotated",
     "SplineGrid",
+    "SquareMap",
     "build_analytic",
     "build_map",
+    "build_planar",
+    "inverted",
 ]

@@ -1,10 +1,18 @@
 """Results: saved artefacts, figures, pictures, exported meshes and what goes along a training."""
 
+from nsm.results.analytic import analytic_surface
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh
 from nsm.results.metrics import overfit_metrics, vertex_error
+from nsm.results.pair_metrics import pair_metrics
+from nsm.results.pair_pictures import (
+    distortion_picture,
+    map_image,
+    morph_pictures,
+    transfer_picture,
+)
 from nsm.results.parameterization import Parameterization, load_parameterization
 from nsm.results.pictures import (
     checkerboard_picture,
@@ -13,10 +21,21 @@ from nsm.results.pictures import (
     parameterization_picture,
     reconstruction_image,
 )
-from nsm.results.tables import comparison_table, metrics_table
+from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map
+from nsm.results.tables import comparison_table, metrics_table, pair_table
 from nsm.results.textures import checkerboard
 
 __all__ = [
+    "SurfaceMap",
+    "analytic_surface",
+    "by_file_vertex",
+    "distortion_picture",
+    "load_surface_map",
+    "map_image",
+    "morph_pictures",
+    "pair_metrics",
+    "pair_table",
+    "transfer_picture",
     "NeuralSurface",
     "Parameterization",
     "atomic_write",

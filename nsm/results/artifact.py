@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nsm.maps import build_map
+from nsm.errors import NsmError
+from nsm.maps import build_analytic, build_map
 from nsm.results.files import misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.surfaces import Surface
@@ -118,13 +119,18 @@ def load_surface(folder: str | Path) -> NeuralSurface:
             **arrays,
         )
         _check_shapes(surface)
-        network = build_map(words["map"])
+        network = _build(words["map"])
         network.load_state_dict({k.removeprefix("map."): v for k, v in tensors.items()})
         metrics, config = dict(words["metrics"]), dict(words["config"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, NsmError) as error:
         raise misfit(path / STEM, error) from error
     network.eval().requires_grad_(False)
     return NeuralSurface(surface, network, metrics, config)
+
+
+def _build(config: dict[str, Any]) -> nn.Module:
+    """A network, or the closed form of an analytic surface, from its configuration."""
+    return build_analytic(config) if "name" in config else build_map(config)
 
 
 def _check_shapes(surface: Surface) -> None:

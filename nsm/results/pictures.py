@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from nsm.results.artifact import NeuralSurface
 
 _GREY = np.array([0.80, 0.82, 0.85])
-_PANEL = 640
+PANEL = 640
 # the reconstruction is drawn with at least this many triangles, so that φ itself is seen
 _FINE_FACES = 30_000
 
@@ -34,36 +34,36 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     """Source beside reconstruction, coloured by distance in percent of the diagonal."""
     error = vertex_error(surface, neural.map)
     scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
-    view = View(surface.vertices, _PANEL)
+    view = View(surface.vertices, PANEL)
     source = view.draw(surface.vertices, surface.faces, _grey)
     colours = scale.to_rgba(error)[:, :3]
     image = view.draw(evaluate(neural.map, surface.uv), surface.faces, lambda blend: blend(colours))
     rms = neural.metrics.get("rms_percent")
     title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
-    figure = _panels([(source, f"{surface.name}: mesh"), (image, title)])
+    figure = panels([(source, f"{surface.name}: mesh"), (image, title)])
     figure.colorbar(
         scale,
         cax=figure.add_axes((0.91, 0.2, 0.012, 0.6)),
         label="distance, % of the diagonal",
         extend="max",
     )
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
     """The neural surface with Ω's checkerboard on it, beside Ω."""
     uv, faces = _fine(surface)
-    image = View(surface.vertices, _PANEL).draw(
+    image = View(surface.vertices, PANEL).draw(
         evaluate(neural.map, uv), faces, lambda blend: checkerboard_at(blend(uv))
     )
-    side = 1.06 * (2 * (np.arange(_PANEL) + 0.5) / _PANEL - 1)
+    side = 1.06 * (2 * (np.arange(PANEL) + 0.5) / PANEL - 1)
     grid = np.stack(np.meshgrid(side, side[::-1]), axis=-1)
     order = 2 if surface.domain == "disc" else np.inf
     inside = np.linalg.norm(grid, ord=order, axis=-1) <= 1
-    flat = checkerboard_at(grid.reshape(-1, 2)).reshape(_PANEL, _PANEL, 3)
+    flat = checkerboard_at(grid.reshape(-1, 2)).reshape(PANEL, PANEL, 3)
     flat = np.where(inside[:, :, None], flat, 1.0)
     titles = f"{surface.name}: neural surface", f"domain Ω: {surface.domain}"
-    _save(_panels([(image, titles[0]), (flat, titles[1])]), path)
+    save_figure(panels([(image, titles[0]), (flat, titles[1])]), path)
 
 
 def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -> np.ndarray:
@@ -91,26 +91,27 @@ def parameterization_picture(
 
     The squares have one size everywhere, so that their images show area and angle distortion.
     """
-    view = View(surface.vertices, _PANEL)
+    view = View(surface.vertices, PANEL)
     above = [
-        (view.draw(surface.vertices, surface.faces, _checked(uv)), name)
-        for name, uv in maps.items()
+        (view.draw(surface.vertices, surface.faces, checked(uv)), name) for name, uv in maps.items()
     ]
-    below = [(layout_image(surface, uv, size=_PANEL), "") for uv in maps.values()]
-    _save(_panels(above, below), path)
+    below = [(layout_image(surface, uv, size=PANEL), "") for uv in maps.values()]
+    save_figure(panels(above, below), path)
 
 
 def layout_image(surface: Surface, uv: np.ndarray, *, size: int = 384) -> np.ndarray:
     """A map (V, 2) of the mesh as it lies in the plane, (size, size, 3) in [0, 1]."""
     flat = np.column_stack([uv, np.zeros(len(uv))])
-    return View(flat, size, frame=np.eye(3)).draw(flat, surface.faces, _checked(uv))
+    return View(flat, size, frame=np.eye(3)).draw(flat, surface.faces, checked(uv))
 
 
-def _checked(uv: np.ndarray) -> Callable[[Blend], np.ndarray]:
+def checked(uv: np.ndarray) -> Callable[[Blend], np.ndarray]:
+    """Colours for :meth:`View.draw`: the checkerboard at coordinates uv (V, 2)."""
     return lambda blend: checkerboard_at(blend(uv))
 
 
-def _panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
+def panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
+    """A figure of pictures with their titles, in rows of equal length."""
     columns = len(rows[0])
     figure = Figure(figsize=(5.5 * columns + 0.6, 5.5 * len(rows)), dpi=120)
     for k, (image, title) in enumerate(panel for row in rows for panel in row):
@@ -122,7 +123,8 @@ def _panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
     return figure
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
     data = io.BytesIO()
     FigureCanvasAgg(figure).print_png(data)
     atomic_write(path, data.getvalue())

@@ -44,3 +44,27 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
     for name, figures in metrics.items():
         table.add_row(name, *(f"{figures[key]:.3f}" for key in _MAP_COLUMNS))
     return table
+
+
+_PAIR_ROWS = {
+    "symmetric_dirichlet_median": ("symmetric Dirichlet, median", "4 at best"),
+    "symmetric_dirichlet_mean": ("symmetric Dirichlet, mean", ""),
+    "symmetric_dirichlet_p95": ("symmetric Dirichlet, 95th percentile", ""),
+    "singular_value_ratio_median": ("σ₁/σ₂, median", "1 at best"),
+    "flipped_percent": ("flipped triangles", "%"),
+    "outside_percent": ("vertices outside Ω", "%"),
+    "landmark_error_mean_percent": ("landmark error, mean", "% of diagonal"),
+    "landmark_error_max_percent": ("landmark error, largest", "% of diagonal"),
+    "covered_percent": ("target covered", "% of area"),
+    "seam_gap_mean_percent": ("gap across the seam, mean", "% of diagonal"),
+    "seam_gap_max_percent": ("gap across the seam, largest", "% of diagonal"),
+}
+
+
+def pair_table(metrics: Mapping[str, float]) -> Table:
+    """The main figures of :func:`nsm.results.pair_metrics` with their names and units."""
+    table = Table("figure", "value", "unit")
+    table.columns[1].justify = "right"
+    for key, (label, unit) in _PAIR_ROWS.items():
+        table.add_row(label, f"{metrics[key]:.3f}", unit)
+    return table

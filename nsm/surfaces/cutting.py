@@ -116,21 +116,46 @@ def cut_to_disc(
         log.append(f"seam led through {len(extremal)} mutually far vertices")
 
     seam = _shortest_seam(graph, edges, terminals, genus)
-    is_cut = np.zeros(len(edges.pairs), dtype=bool)
-    is_cut[seam] = True
-    cut_faces, origin = topology.cut_along(faces, is_cut)
-    if not topology.is_disc(cut_faces):
-        raise NsmError(
-            f"{name}: the seam does not leave a disc (genus {genus}, {len(graph.loops)} holes); "
-            "give other seam_vertices"
-        )
     if seam:
         log.append(
             f"cut along {len(seam)} edges (genus {genus}, {len(graph.loops)} boundary loops)"
         )
+    return _opened(vertices, faces, seam, log, name)
+
+
+def cut_along_paths(
+    vertices: np.ndarray, faces: np.ndarray, paths: Sequence[Sequence[int]], *, name: str = "mesh"
+) -> Cut:
+    """Cut (V,3), (F,3) open along paths of neighbouring vertices.
+
+    NsmError if that does not leave a disc.
+    """
+    edges = topology.edges_of(faces)
+    number = {(int(a), int(b)): e for e, (a, b) in enumerate(edges.pairs)}
+    seam = [
+        number[(min(a, b), max(a, b))]
+        for path in paths
+        for a, b in zip(path[:-1], path[1:], strict=True)
+    ]
+    log = [f"cut along {len(seam)} edges between {len(paths) + 1} landmarks"]
+    return _opened(vertices, faces, seam, log, name)
+
+
+def _opened(
+    vertices: np.ndarray, faces: np.ndarray, seam: list[int], log: list[str], name: str
+) -> Cut:
+    is_cut = np.zeros(len(topology.edges_of(faces).pairs), dtype=bool)
+    is_cut[seam] = True
+    cut_faces, origin = topology.cut_along(faces, is_cut)
+    if not topology.is_disc(cut_faces):
+        raise NsmError(
+            f"{name}: the seam does not leave a disc (Euler characteristic "
+            f"{topology.euler_characteristic(cut_faces)}, "
+            f"{len(topology.boundary_loops(cut_faces))} boundary loops); give other seam_vertices"
+        )
     points, cut_faces, inserted = split_chords(vertices[origin], cut_faces)
     if inserted:
-        log.append(f"{inserted} inner edges between boundary vertices split in the middle")
+        log = [*log, f"{inserted} inner edges between boundary vertices split in the middle"]
     origin = np.concatenate([origin, np.full(inserted, -1)])
     loop = topology.boundary_loops(cut_faces)[0]
     return Cut(points, cut_faces, origin, _twins(origin), loop, tuple(log))

@@ -26,6 +26,18 @@ _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 @dataclass(frozen=True)
+class Keys:
+    """Boundary vertices (K,) that are held at fractions (K,) in [0, 1) of the way around ∂Ω.
+
+    Both run counter-clockwise, as the boundary loop does. On the disc a fraction t is the angle
+    2πt; on the square the way starts at the corner (-1, -1), and corners are at quarters.
+    """
+
+    vertices: np.ndarray
+    fractions: np.ndarray
+
+
+@dataclass(frozen=True)
 class Parameterization:
     """uv (V,2) in the domain, tutte (V,2) where it started, log."""
 
@@ -41,11 +53,13 @@ def parameterize(
     domain: str = "disc",
     method: str = "slim",
     name: str = "mesh",
+    keys: Keys | None = None,
 ) -> Parameterization:
     """Map a disc-shaped mesh (V,3), (F,3) injectively onto the domain.
 
-    The mesh should have the area of the domain. NsmError for an unknown domain or method, or if
-    even Tutte's embedding has flipped triangles in floating point.
+    The mesh should have the area of the domain. Keys stay where they are said to be. NsmError
+    for an unknown domain or method, or if even Tutte's embedding has flipped triangles in
+    floating point.
     """
     if domain not in DOMAINS:
         raise NsmError(f"{name}: unknown domain '{domain}'; use one of {', '.join(DOMAINS)}")
@@ -55,7 +69,7 @@ def parameterize(
         )
     log: list[str] = []
     loop = topology.boundary_loops(faces)[0]
-    boundary = boundary_positions(vertices, loop, domain, name)
+    boundary = boundary_positions(vertices, loop, domain, name, keys)
     start = tutte(vertices, faces, loop, boundary)
     if flipped_triangles(start, faces):
         start = tutte(vertices, faces, loop, boundary, weights="mean_value")
@@ -69,7 +83,7 @@ def parameterize(
     uv = start
     if method == "slim":
         held = _slim_held(vertices, faces, start, loop, boundary, log)
-        uv = slide(vertices, faces, held, loop, domain, _sliding_steps(len(faces)))
+        uv = slide(vertices, faces, held, loop, domain, _sliding_steps(len(faces)), keys)
         if flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop):
             uv = start
             log.append("SLIM result was not injective: Tutte's embedding kept")
@@ -77,12 +91,19 @@ def parameterize(
 
 
 def boundary_positions(
-    vertices: np.ndarray, loop: np.ndarray, domain: str, name: str = "mesh"
+    vertices: np.ndarray,
+    loop: np.ndarray,
+    domain: str,
+    name: str = "mesh",
+    keys: Keys | None = None,
 ) -> np.ndarray:
     """Positions (B,2) of the boundary loop (B,) on the boundary of the domain, by arc length.
 
     On the square four vertices of the loop, near the quarters of its length, become the corners.
+    With keys, arc length counts between neighbouring keys.
     """
+    if keys is not None:
+        return at_fractions(_fractions(vertices, loop, keys, domain), domain)
     points = vertices[loop]
     lengths = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     along = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -103,6 +124,52 @@ def boundary_positions(
         share = (along[first:last] - along[first]) / (along[last] - along[first])
         begin, end = _CORNERS[side], _CORNERS[(side + 1) % 4]
         result[first:last] = begin + share[:, None] * (end - begin)
+    return result
+
+
+def at_fractions(t: np.ndarray, domain: str) -> np.ndarray:
+    """Points (B,2) of ∂Ω at fractions (B,) of the way around it (see :class:`Keys`)."""
+    if domain == "disc":
+        angle = 2 * np.pi * t
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    side = np.floor(4 * t).astype(int) % 4
+    share = (4 * t - np.floor(4 * t))[:, None]
+    return _CORNERS[side] + share * (_CORNERS[(side + 1) % 4] - _CORNERS[side])
+
+
+def fractions_of(points: np.ndarray, domain: str) -> np.ndarray:
+    """Fractions (B,) in [0, 1) of points (B,2) of ∂Ω: the inverse of :func:`at_fractions`."""
+    u, v = points.T
+    if domain == "disc":
+        return (np.arctan2(v, u) / (2 * np.pi)) % 1.0
+    sides = np.stack([-v, u, v, -u])  # each side is where one of these is 1
+    along = np.stack([u, v, -u, -v])
+    side = sides.argmax(axis=0)
+    share = 0.5 * (along[side, np.arange(len(points))] + 1)
+    return (0.25 * (side + share)) % 1.0
+
+
+def _fractions(vertices: np.ndarray, loop: np.ndarray, keys: Keys, domain: str) -> np.ndarray:
+    """Fractions (B,) of the loop's vertices, by arc length between neighbouring keys."""
+    place = {int(v): k for k, v in enumerate(loop)}
+    stops = [place[int(v)] for v in keys.vertices]
+    lengths = np.linalg.norm(vertices[np.roll(loop, -1)] - vertices[loop], axis=1)
+    result = np.empty(len(loop))
+    for k, first in enumerate(stops):
+        last = stops[(k + 1) % len(stops)]
+        count = (last - first) % len(loop) or len(loop)
+        run = (first + np.arange(count)) % len(loop)
+        along = np.concatenate([[0.0], np.cumsum(lengths[run])])
+        begin = keys.fractions[k]
+        span = (keys.fractions[(k + 1) % len(stops)] - begin) % 1.0 or 1.0
+        result[run] = (begin + span * along[:-1] / along[-1]) % 1.0
+    if domain == "square":  # a corner without a key takes the nearest vertex that is none
+        free = np.setdiff1d(np.arange(len(loop)), stops)
+        for corner in (0.0, 0.25, 0.5, 0.75):
+            if np.isclose(result[stops], corner, atol=1e-12).any():
+                continue
+            gap = np.abs((result[free] - corner + 0.5) % 1.0 - 0.5)
+            result[free[gap.argmin()]] = corner
     return result
 
 
@@ -215,8 +282,9 @@ def slide(
     loop: np.ndarray,
     domain: str,
     steps: int,
+    keys: Keys | None = None,
 ) -> np.ndarray:
-    """SLIM steps from an injective uv (V,2) with boundary vertices free to slide.
+    """SLIM steps from an injective uv (V,2) with boundary vertices, but for keys, free to slide.
 
     Each step solves SLIM's weighted least-squares proxy in the remaining freedom (two coordinates
     inside, one along the boundary, none at the corners of the square), then searches along it for
@@ -227,6 +295,8 @@ def slide(
     on_boundary[loop] = True
     inner = np.flatnonzero(~on_boundary)
     moving = loop if domain == "disc" else loop[np.abs(uv[loop]).min(axis=1) < 1.0]
+    if keys is not None:
+        moving = moving[~np.isin(moving, keys.vertices)]
     energy = _energy(gradient, area, faces, uv)
     for _ in range(steps):
         direction = _proxy_step(gradient, area, faces, uv, inner, moving, domain)

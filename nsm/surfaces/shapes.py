@@ -72,6 +72,18 @@ def cone(rings: int = 24, height: float = 1.5) -> Mesh:
     )
 
 
+def ring_mesh(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """A triangulated unit disc of rings: points (V, 2), faces (F, 3)."""
+    radius, angle, faces = _rings(rings)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1), faces
+
+
+def grid_mesh(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """A triangulated square [-1, 1]² of side × side points: points (V, 2), faces (F, 3)."""
+    x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+    return np.stack([x.ravel(), y.ravel()], axis=1), grid_faces(side, side)
+
+
 def _rings(rings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Radius (V,) in [0,1], angle (V,) and faces of a disc of rings; ring k has 6k vertices."""
     radius, angle = [np.zeros(1)], [np.zeros(1)]

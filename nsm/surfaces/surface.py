@@ -16,12 +16,13 @@ from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.cutting import cut_to_disc
+from nsm.surfaces.cutting import Cut, cut_to_disc
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.parameterization import (
     DOMAIN_AREA,
     DOMAINS,
     METHODS,
+    Keys,
     boundary_self_intersections,
     flipped_triangles,
     parameterize,
@@ -134,10 +135,10 @@ class Surface:
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         if stored is not None:
-            return cls._from_stored(name, domain, stored)
+            return cls.from_stored(name, domain, stored)
         surface = cls._prepare(vertices, faces, name, domain, seam, parameterization, log)
         if cache:
-            cache_.write(key, surface._to_stored())
+            cache_.write(key, surface.to_stored())
         return surface
 
     @classmethod
@@ -151,7 +152,6 @@ class Surface:
         method: str,
         log: Sequence[str],
     ) -> Surface:
-        start = time.perf_counter()
         mesh = clean(vertices, faces, name)
         if seam is not None:
             for v in seam:
@@ -162,12 +162,43 @@ class Surface:
                     )
             seam = [int(mesh.merged[v]) for v in seam]
         cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
+        words = (*log, *mesh.log)
+        return cls.from_cut(
+            cut, mesh.source_vertex, name=name, domain=domain, parameterization=method, log=words
+        )
+
+    @classmethod
+    def from_cut(
+        cls,
+        cut: Cut,
+        source_vertex: np.ndarray,
+        *,
+        name: str = "mesh",
+        domain: str = "disc",
+        parameterization: str = "slim",
+        keys: Keys | None = None,
+        log: Sequence[str] = (),
+    ) -> Surface:
+        """Normalise and parameterise a mesh that is a disc already.
+
+        Args:
+            cut: the disc, with the vertices of the whole mesh that its own came from.
+            source_vertex: (W,) the mesh file's vertex of each of these.
+            keys: boundary vertices held at given places of ∂Ω.
+            name, domain, parameterization, log: as for :meth:`from_arrays`.
+
+        Raises:
+            NsmError: the mesh cannot be flattened without flips.
+        """
+        start = time.perf_counter()
         center = 0.5 * (cut.vertices.min(axis=0) + cut.vertices.max(axis=0))
         centred = cut.vertices - center
         area = float(topology.face_areas(centred, cut.faces).sum())
         scale = float(np.sqrt(DOMAIN_AREA[domain] / area))
         normalised = centred * scale
-        flat = parameterize(normalised, cut.faces, domain=domain, method=method, name=name)
+        flat = parameterize(
+            normalised, cut.faces, domain=domain, method=parameterization, name=name, keys=keys
+        )
         flipped = flipped_triangles(flat.uv, cut.faces)
         crossings = boundary_self_intersections(flat.uv, cut.loop)
         if flipped or crossings:
@@ -175,7 +206,7 @@ class Surface:
                 f"{name}: the parameterisation is not injective ({flipped} flipped triangles, "
                 f"{crossings} boundary crossings); give seam_vertices at the tips of long parts"
             )
-        source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
+        source = np.where(cut.origin >= 0, source_vertex[cut.origin], -1)
         quality = {
             "flipped_triangles": float(flipped),
             "boundary_self_intersections": float(crossings),
@@ -197,10 +228,11 @@ class Surface:
             scale=scale,
             center=center,
             quality=quality,
-            log=(*log, *mesh.log, *cut.log, *flat.log),
+            log=(*log, *cut.log, *flat.log),
         )
 
-    def _to_stored(self) -> dict[str, np.ndarray]:
+    def to_stored(self) -> dict[str, np.ndarray]:
+        """The arrays that :meth:`from_stored` makes the surface of, but for name and domain."""
         words = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
         return {
             "vertices": self.vertices,
@@ -213,7 +245,8 @@ class Surface:
         }
 
     @classmethod
-    def _from_stored(cls, name: str, domain: str, stored: dict[str, np.ndarray]) -> Surface:
+    def from_stored(cls, name: str, domain: str, stored: dict[str, np.ndarray]) -> Surface:
+        """The surface of arrays that :meth:`to_stored` gave."""
         words: dict[str, Any] = json.loads(stored["words"].tobytes())
         return cls(
             name=name,

@@ -1,0 +1,75 @@
+"""Samples of several surfaces at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from nsm.data.overfit import HELD_OUT_SEED, Steps
+from nsm.data.sampling import SurfaceSampler
+from nsm.surfaces import Surface
+
+
+class CollectionData(pl.LightningDataModule):
+    """Points (N, 2) of the common domain, equally many by area of each surface.
+
+    Args:
+        surfaces: the prepared surfaces.
+        turns: (k, 2, 2) rotations from the common domain to that of each surface.
+        batch_size: points a step, of all surfaces together.
+        steps_per_epoch: steps between two looks at the held-out points.
+        vertex_share: share of a batch that are mesh vertices, in [0, 1].
+        held_out: points on which the distortion is followed; never trained on.
+        pool: not used; the paper draws afresh for maps.
+        seed: of the training samples.
+    """
+
+    def __init__(
+        self,
+        surfaces: Sequence[Surface],
+        turns: Tensor,
+        *,
+        batch_size: int,
+        steps_per_epoch: int,
+        vertex_share: float,
+        held_out: int,
+        pool: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.surfaces, self.turns = surfaces, turns
+        self.share = max(1, batch_size // len(surfaces))
+        self.held_share = max(1, held_out // len(surfaces))
+        self.steps_per_epoch, self.vertex_share, self.seed = steps_per_epoch, vertex_share, seed
+
+    def setup(self, stage: str | None = None) -> None:
+        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        self.samplers = [SurfaceSampler(surface, device) for surface in self.surfaces]
+        self.turns = self.turns.to(device)
+
+    def batch(self, step: int) -> Tensor:
+        """The training samples (N, 2) of a step."""
+        return self._drawn(self.share, self.vertex_share, self.seed, step)
+
+    def _drawn(self, count: int, vertex_share: float, seed: int, step: int) -> Tensor:
+        # one stream for all: the samples of the surfaces are independent
+        generator = self.samplers[0].generator(seed, step)
+        parts = [
+            sampler.draw(count, vertex_share, generator).uv @ turn  # R⁻¹ = Rᵀ
+            for sampler, turn in zip(self.samplers, self.turns, strict=True)
+        ]
+        return torch.cat(parts)
+
+    def train_dataloader(self) -> DataLoader[Tensor]:
+        trainer = self.trainer
+        assert trainer is not None
+        steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
+        return DataLoader(steps, batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[Tensor]:
+        points = self._drawn(self.held_share, 0.0, HELD_OUT_SEED, 0)
+        return DataLoader(list(points.split(8192)), batch_size=None)  # type: ignore[arg-type]

@@ -1,0 +1,59 @@
+"""From a checked configuration to a run folder with results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from nsm.config import checked
+from nsm.errors import NsmError
+from nsm.pipeline.common import CONFIG_FILE, quiet_lightning
+from nsm.pipeline.overfit import build_overfit, run_overfit
+from nsm.pipeline.pair_map import run_pair_map
+from nsm.pipeline.param import run_param
+
+__all__ = [
+    "TASKS",
+    "build_overfit",
+    "quiet_lightning",
+    "run",
+    "run_overfit",
+    "run_pair_map",
+    "run_param",
+]
+
+TASKS: dict[str, Callable[..., Any]] = {
+    "overfit": run_overfit,
+    "param": run_param,
+    "pair_map": run_pair_map,
+}
+
+
+def run(config: DictConfig, folder: Path) -> None:
+    """Run the task of a configuration in a folder.
+
+    With ``resume`` set, the folder's own configuration takes its place, and the training goes on
+    from its checkpoint.
+
+    Raises:
+        NsmError: bad input of any kind.
+    """
+    resuming = config.resume is not None
+    if resuming:
+        config = _stored_config(folder)
+    if config.task.name not in TASKS:
+        raise NsmError(f"task.name={config.task.name} is not one of {', '.join(TASKS)}")
+    TASKS[config.task.name](config, folder, resuming=resuming)
+
+
+def _stored_config(folder: Path) -> DictConfig:
+    file = folder / CONFIG_FILE
+    if not file.is_file():
+        raise NsmError(f"resume={folder}: no {CONFIG_FILE} there; give the folder of a run")
+    stored = OmegaConf.load(file)
+    if not isinstance(stored, DictConfig):
+        raise NsmError(f"{file}: not a configuration; start the run again")
+    return checked(stored)

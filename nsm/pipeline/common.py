@@ -1,0 +1,191 @@
+"""What all runs share: building a module, training it in its folder, and what is left there."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.callbacks import Callback, LearningRateMonitor
+from pytorch_lightning.loggers import TensorBoardLogger
+from rich.console import Console
+
+from nsm.data import OverfitData
+from nsm.errors import NsmError
+from nsm.results import atomic_write
+from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
+from nsm.results.progress import TrainingProgress
+from nsm.surfaces import Surface
+
+CONFIG_FILE = "config.yaml"
+CHECKPOINT_FILE = "last.ckpt"
+
+
+def built(config: DictConfig, make: Callable[[dict[str, Any]], Any]) -> Any:
+    """The module that ``make`` makes of the settings, seeded.
+
+    Raises:
+        NsmError: settings that do not fit together.
+    """
+    pl.seed_everything(config.seed, verbose=False)
+    try:
+        module = make(plain(config))
+        module.configure_optimizers()  # settings that do not fit are told before any work
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise NsmError(f"setting: {' '.join(str(error).split())}") from error
+    return module
+
+
+def with_map(settings: dict[str, Any], **network: Any) -> dict[str, Any]:
+    """The settings that every task's module takes; ``network`` adds to the map's."""
+    groups = {"activation": settings["activation"], "encoding": settings["encoding"]}
+    return {
+        "map": {**network, **settings["map"], **groups},
+        "optimizer": settings["optimizer"],
+        "scheduler": settings["scheduler"],
+        "max_steps": settings["trainer"]["max_steps"],
+    }
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """The configuration as dictionaries and lists."""
+    container = OmegaConf.to_container(config)
+    assert isinstance(container, dict)
+    return container  # type: ignore[return-value]
+
+
+def configured_surface(config: DictConfig) -> Surface:
+    """The surface of the group ``surface``, prepared; NsmError if it cannot be."""
+    settings = config.surface
+    if settings.path is not None:
+        settings.path = os.path.abspath(settings.path)  # resuming works from any folder
+    return Surface.load(
+        settings.path if settings.path is not None else settings.name,
+        domain=config.domain,
+        seam_vertices=settings.seam_vertices,
+        parameterization=settings.parameterization,
+        cache=settings.cache,
+    )
+
+
+def report_surface(console: Console, surface: Surface) -> None:
+    """Print what a prepared surface is and what was done to it."""
+    console.print(
+        f"{surface.name}: {len(surface.vertices)} vertices, {len(surface.faces)} faces on the "
+        f"{surface.domain}, median symmetric Dirichlet "
+        f"{surface.quality['median_symmetric_dirichlet']:.2f}",
+        soft_wrap=True,
+    )
+    for line in surface.log:
+        console.print(f"  {line}", soft_wrap=True)
+
+
+def train(
+    config: DictConfig,
+    folder: Path,
+    surface: Surface,
+    module: Any,
+    console: Console,
+    pictures: Pictures,
+    *,
+    resuming: bool,
+    title: str | None = None,
+) -> pl.Trainer:
+    """Train a module on samples of a surface in its run folder.
+
+    ``title`` stands beside the progress bar, the surface's name by default. KeyboardInterrupt if
+    the user stops it.
+    """
+    data = OverfitData(surface, **plain(config)["data"], seed=config.seed)
+    settings = config.trainer
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
+    callbacks: list[Callback] = [
+        GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window),
+        AtomicCheckpoint(folder / CHECKPOINT_FILE),
+    ]
+    if settings.progress:
+        shown = (module.progress_figure, module.progress_form)
+        callbacks.append(
+            TrainingProgress(console, f"{config.task.name} {title or surface.name}", *shown)
+        )
+    logger: TensorBoardLogger | bool = False
+    if config.logger.tensorboard:
+        logger = TensorBoardLogger(save_dir=folder, name="", version="tensorboard")
+        callbacks += [LearningRateMonitor(), pictures]
+    quiet_lightning()
+    accelerator = settings.accelerator
+    if accelerator == "auto":  # Lightning would choose Apple's GPU, which has no float64
+        accelerator = "gpu" if torch.cuda.is_available() else "cpu"
+    try:
+        trainer = pl.Trainer(
+            accelerator=accelerator,
+            devices=1,
+            max_steps=settings.max_steps,
+            max_epochs=-1,
+            gradient_clip_val=settings.gradient_clip,
+            logger=logger,
+            callbacks=callbacks,
+            log_every_n_steps=config.logger.every,
+            num_sanity_val_steps=0,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            enable_checkpointing=False,
+        )
+    except Exception as error:  # Lightning's own exceptions for hardware that is not there
+        reason = " ".join(str(error).split())
+        raise NsmError(f"setting trainer.accelerator={accelerator}: {reason}") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
+    # killed before the first checkpoint, a run starts again from its beginning
+    checkpoint = folder / CHECKPOINT_FILE
+    _fit(trainer, module, data, checkpoint if resuming and checkpoint.is_file() else None)
+    if trainer.interrupted:
+        console.print(f"interrupted; go on with: nsm resume={folder}", soft_wrap=True)
+        raise KeyboardInterrupt
+    return trainer
+
+
+def quiet_lightning() -> None:
+    """Leave out Lightning's remarks on data loaders and hardware: they do not concern samples that
+    are made on the device."""
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="pytorch_lightning")
+    warnings.filterwarnings("ignore", module="lightning_fabric")
+
+
+def _fit(
+    trainer: pl.Trainer, module: pl.LightningModule, data: OverfitData, checkpoint: Path | None
+) -> None:
+    if checkpoint is None:
+        trainer.fit(module, datamodule=data)
+        return
+    try:
+        torch.load(checkpoint, weights_only=True, map_location="cpu")
+    except Exception as error:  # whatever a damaged or foreign file raises
+        raise NsmError(
+            f"{checkpoint}: damaged, or not a checkpoint of nsm; delete it to start again"
+        ) from error
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+
+
+def write_figures(
+    folder: Path, surface: Surface, trainer: pl.Trainer, started: float, figures: dict[str, Any]
+) -> None:
+    """Write metrics.json, last of all: its presence says that the run is complete."""
+    words = {
+        "surface": surface.name,
+        "steps": trainer.global_step,
+        "seconds": round(time.monotonic() - started, 2),
+        "preparation": surface.quality,
+        **figures,
+    }
+    atomic_write(folder / "metrics.json", (json.dumps(words, indent=2) + "\n").encode())

@@ -1,0 +1,177 @@
+"""task=pair_map: a map from one surface to another."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytorch_lightning as pl
+import torch
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from nsm.pipeline.attributes import transfer_attributes
+from nsm.pipeline.common import built, plain, train, with_map, write_figures
+from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
+from nsm.results import (
+    NeuralSurface,
+    SurfaceMap,
+    by_file_vertex,
+    checkerboard,
+    distortion_picture,
+    export_mesh,
+    map_image,
+    morph_pictures,
+    pair_metrics,
+    pair_table,
+    transfer_picture,
+)
+from nsm.results.callbacks import Pictures
+from nsm.results.metrics import evaluate
+from nsm.surfaces.together import Matched, matched_landmarks
+from nsm.tasks import PairMap
+from nsm.tasks.start import landmark_rotation, least_distorting_rotation
+
+_MORPH_FRAMES = 9
+
+
+def run_pair_map(
+    config: DictConfig,
+    folder: Path,
+    source: Any = None,
+    target: Any = None,
+    landmarks: Any = None,
+    *,
+    resuming: bool = False,
+) -> SurfaceMap:
+    """Map one surface to another, and leave all results in the folder.
+
+    Args:
+        config: as :func:`nsm.config.compose_config` gives it, with ``task=pair_map``.
+        folder: the run folder.
+        source, target: surfaces as :func:`nsm.pipeline.inputs.read_shape` takes them; those of
+            the configuration by default.
+        landmarks: as :func:`nsm.pipeline.inputs.landmark_vertices` takes them.
+        resuming: go on from the folder's checkpoint.
+
+    Raises:
+        NsmError: a surface, landmark, setting or run folder that cannot be used.
+    """
+    console = Console(highlight=False)
+    started = time.monotonic()
+    for key in ("source", "target", "landmarks"):
+        config[key] = absolute_paths(config[key])  # resuming works from any folder
+    settings = plain(config)
+    shapes = [
+        read_shape(settings[key] if given is None else given, config.domain, key)
+        for key, given in (("source", source), ("target", target))
+    ]
+    ids = landmark_vertices(settings["landmarks"] if landmarks is None else landmarks, shapes)
+    phi, psi = neural_surfaces(config, shapes, ids, console)
+    matched = matched_landmarks([phi.surface, psi.surface], ids)
+    module = build_pair_map(config, phi, psi, matched)
+    points, targets = matched.points
+
+    def picture(m: pl.LightningModule) -> np.ndarray:
+        return map_image(phi.surface, psi.surface, evaluate(m, phi.surface.uv))
+
+    trainer = train(
+        config,
+        folder,
+        phi.surface,
+        module,
+        console,
+        Pictures("map", picture, config.logger.pictures),
+        resuming=resuming,
+        title=f"{phi.surface.name} → {psi.surface.name}",
+    )
+    h = module.map.cpu().eval().requires_grad_(False)
+    result = SurfaceMap(phi, psi, h, np.stack(ids, axis=1), {}, settings)
+    result.metrics.update(
+        pair_metrics(phi.surface, psi.surface, result.image_uv, evaluate(h, points), targets)
+    )
+    _write(folder, result)
+    transfer_attributes(settings["attributes"], folder, result)
+    write_figures(
+        folder,
+        phi.surface,
+        trainer,
+        started,
+        {"target": psi.surface.name, "landmarks": len(ids[0]), "metrics": result.metrics},
+    )
+    console.print(pair_table(result.metrics))
+    console.print(f"results in {folder}", soft_wrap=True)
+    return result
+
+
+def build_pair_map(
+    config: DictConfig, phi: NeuralSurface, psi: NeuralSurface, matched: Matched
+) -> PairMap:
+    """The pair_map task's module, seeded.
+
+    Raises:
+        NsmError: settings of the network, energy, optimiser or schedule that do not fit together.
+    """
+    surface = phi.surface
+    # where the seams correspond, both sides of the source's should go to one curve
+    alike = len(psi.surface.twins) and matched.on_boundary >= 2
+    twins = surface.twins if alike else surface.twins[:0]
+    p, q, uv, seam = (
+        torch.as_tensor(array, dtype=torch.float32)
+        for array in (*matched.points, surface.uv, surface.uv[twins])
+    )
+    if len(p):
+        turn = landmark_rotation(config.domain, p, q)
+    else:
+        some = uv[:: len(uv) // 4096 + 1]
+        turn = least_distorting_rotation(config.domain, phi.map, psi.map, some)
+    return built(
+        config,
+        lambda common: PairMap(
+            **with_map(common),
+            domain=config.domain,
+            weights={name: float(w) for name, w in config.energy.weights.items()},
+            **common["constraints"],
+            points=p,
+            targets=q,
+            seam=seam,
+            turn=turn,
+            phi=phi.map,
+            psi=psi.map,
+        ),
+    )
+
+
+def _write(folder: Path, f: SurfaceMap) -> None:
+    f.save(folder)
+    s, t = f.source.surface, f.target.surface
+    image = f.target.in_original_units(f.image)
+    np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))
+    meshes = {
+        "mapped": (image, s.faces, s.uv),
+        "target_with_source_uv": (f.target.in_original_units(t.vertices), t.faces, f.source_uv),
+        "source_with_target_uv": (f.source.in_original_units(s.vertices), s.faces, f.image_uv),
+    }
+    for name, mesh in meshes.items():
+        export_mesh(folder / f"{name}.obj", *mesh)
+        export_mesh(folder / f"{name}.glb", *mesh, texture=checkerboard())
+    (folder / "morph").mkdir(exist_ok=True)
+    for k in range(_MORPH_FRAMES):
+        vertices = f.morph(k / (_MORPH_FRAMES - 1))
+        export_mesh(folder / "morph" / f"{k:02d}.obj", vertices, s.faces, s.uv)
+    transfer_picture(folder / "transfer.png", f)
+    distortion_picture(folder / "distortion.png", f)
+    morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def absolute_paths(given: Any) -> Any:
+    """A setting with each path in it that exists made absolute."""
+    if isinstance(given, str):
+        return os.path.abspath(given) if Path(given).exists() else given
+    if OmegaConf.is_list(given) or (isinstance(given, Sequence)):
+        return [absolute_paths(item) for item in given]
+    return given

@@ -1,0 +1,115 @@
+"""Quality of a map between two surfaces, measured on the meshes themselves.
+
+The image of a source vertex is looked up on the target's mesh, so that no figure depends on how
+well a network stands for its surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from nsm.energies import (
+    arap,
+    area,
+    conformal,
+    signed_distance,
+    singular_value_ratio,
+    symmetric_dirichlet,
+)
+from nsm.results.map_metrics import triangle_metric
+from nsm.surfaces import Surface
+from nsm.surfaces.location import locate
+from nsm.surfaces.parameterization import signed_areas
+from nsm.surfaces.topology import boundary_loops, face_areas
+
+ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
+    symmetric_dirichlet,
+    conformal,
+    singular_value_ratio,
+    area,
+    arap,
+)
+# Float32 places a point of the boundary this well, and no better.
+ON_BOUNDARY = 1e-6
+_COVER_SAMPLES = 20_000
+
+
+def distortion_figures(
+    source: np.ndarray, image: np.ndarray, faces: np.ndarray
+) -> dict[str, float]:
+    """Median, area-weighted mean and 95th percentile of each energy over the triangles.
+
+    Args:
+        source: vertices (V, 3) of the source mesh.
+        image: where they go, (V, 3) or (V, 2).
+        faces: (F, 3).
+    """
+    a, b = triangle_metric(source, faces), triangle_metric(image, faces)
+    weights = face_areas(source, faces)
+    figures: dict[str, float] = {}
+    for energy in ENERGIES:
+        value = energy(a, b).numpy()
+        name = energy.__name__
+        figures[f"{name}_median"] = float(np.median(value))
+        figures[f"{name}_mean"] = float(np.average(value, weights=weights))
+        figures[f"{name}_p95"] = float(np.percentile(value, 95))
+    return figures
+
+
+def pair_metrics(
+    source: Surface,
+    target: Surface,
+    image_uv: np.ndarray,
+    landmark_image: np.ndarray,
+    landmark_target: np.ndarray,
+) -> dict[str, float]:
+    """The figures of METHOD's "How quality is measured", maps.
+
+    Args:
+        source, target: the surfaces.
+        image_uv: h at the source's vertices, (V, 2), in the target's domain.
+        landmark_image: where h sends the landmarks' preimages, (K, 2).
+        landmark_target: where it should, (K, 2).
+
+    Returns:
+        The figures of :func:`distortion_figures`; flipped_percent (signed area in Ω);
+        outside_percent of vertices; boundary_distance_max of the boundary's image from ∂Ω, in
+        units of Ω; landmark_error_mean_percent and _max_percent, on the target, of its bounding
+        box's diagonal; covered_percent of the target's area; seam_gap_mean_percent and
+        _max_percent, the distance on the target between the images of two seam vertices that
+        were one point, of the diagonal.
+    """
+
+    def lifted(uv: np.ndarray) -> np.ndarray:
+        return locate(uv, target.uv, target.faces).take(target.vertices, target.faces)
+
+    image = lifted(image_uv)
+    to_percent = 100 / target.bounding_box_diagonal
+    figures = distortion_figures(source.vertices, image, source.faces)
+    flipped = signed_areas(image_uv, source.faces) <= 0
+    distance = signed_distance(source.domain, torch.from_numpy(image_uv)).numpy()
+    loop = boundary_loops(source.faces)[0]
+    error = np.linalg.norm(lifted(landmark_image) - lifted(landmark_target), axis=1)
+    gap = np.linalg.norm(image[source.twins[:, 0]] - image[source.twins[:, 1]], axis=1)
+    figures["flipped_percent"] = 100 * float(flipped.mean())
+    figures["outside_percent"] = 100 * float((distance > ON_BOUNDARY).mean())
+    figures["boundary_distance_max"] = float(np.abs(distance[loop]).max())
+    for name, values in (("landmark_error", error), ("seam_gap", gap)):
+        figures[f"{name}_mean_percent"] = float(values.mean() * to_percent) if len(values) else 0.0
+        figures[f"{name}_max_percent"] = float(values.max() * to_percent) if len(values) else 0.0
+    figures["covered_percent"] = _covered_percent(source, target, image_uv)
+    return figures
+
+
+def _covered_percent(source: Surface, target: Surface, image_uv: np.ndarray) -> float:
+    """Share of the target's area that lies in the image of some triangle of the source."""
+    random = np.random.default_rng(0)
+    areas = face_areas(target.vertices, target.faces)
+    face = random.choice(len(areas), size=_COVER_SAMPLES, p=areas / areas.sum())
+    weights = random.dirichlet(np.ones(3), size=_COVER_SAMPLES)
+    uv = (weights[:, :, None] * target.uv[target.faces[face]]).sum(axis=1)
+    nearest = locate(uv, image_uv, source.faces).take(image_uv, source.faces)
+    return 100 * float((np.linalg.norm(nearest - uv, axis=1) <= ON_BOUNDARY).mean())

@@ -1,0 +1,112 @@
+"""Pictures of maps between surfaces."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from PIL import Image
+
+from nsm.energies import symmetric_dirichlet
+from nsm.results.files import atomic_write
+from nsm.results.map_metrics import triangle_metric
+from nsm.results.pictures import PANEL, checked, panels, save_figure
+from nsm.results.render import Blend, View
+from nsm.results.surface_map import SurfaceMap
+from nsm.surfaces import Surface
+from nsm.surfaces.location import locate
+
+_STRIP, _GIF = 360, 420
+_WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
+
+
+def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
+    """The source's checkerboard, and colours by its position, beside those carried to the target.
+
+    The target is drawn with its own triangles, turned to lie best on the source.
+    """
+    s, t = f.source.surface, f.target.surface
+    target = f.aligned(t.vertices)
+    low, extent = s.vertices.min(axis=0), np.ptp(s.vertices, axis=0)
+    colours = (s.vertices - low) / np.maximum(extent, 1e-12)
+    carried = f._back.take(colours, s.faces)
+    left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
+    rows = [
+        [
+            (left.draw(s.vertices, s.faces, checked(s.uv)), f"{s.name}: its checkerboard"),
+            (right.draw(target, t.faces, checked(f.source_uv)), f"carried to {t.name}"),
+        ],
+        [
+            (left.draw(s.vertices, s.faces, lambda blend: blend(colours)), "colours of position"),
+            (right.draw(target, t.faces, lambda blend: blend(carried)), f"carried to {t.name}"),
+        ],
+    ]
+    save_figure(panels(*rows), path)
+
+
+def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
+    """Symmetric Dirichlet on the source and on its image, and how it is distributed."""
+    s = f.source.surface
+    value = symmetric_dirichlet(
+        triangle_metric(s.vertices, s.faces), triangle_metric(f.image, s.faces)
+    ).numpy()
+    at_vertex = np.zeros(len(s.vertices))
+    count = np.zeros(len(s.vertices))
+    np.add.at(at_vertex, s.faces.ravel(), np.repeat(np.minimum(value, 1e3), 3))
+    np.add.at(count, s.faces.ravel(), 1)
+    scale = ScalarMappable(LogNorm(4, _WORST), "viridis")
+    colours = scale.to_rgba(at_vertex / np.maximum(count, 1))[:, :3]
+
+    def paint(blend: Blend) -> np.ndarray:
+        return blend(colours)
+
+    view = View(s.vertices, PANEL)
+    image = f.aligned_image
+    other = View(image, PANEL, frame=view.frame)
+    figure = panels(
+        [
+            (view.draw(s.vertices, s.faces, paint), f"{s.name}: symmetric Dirichlet"),
+            (other.draw(image, s.faces, paint), f"its image on {f.target.surface.name}"),
+            (np.ones((PANEL, PANEL, 3)), ""),
+        ]
+    )
+    axes = figure.axes[2]
+    axes.clear()
+    axes.set_position((0.64, 0.14, 0.24, 0.74))
+    axes.hist(np.clip(value, 4, _WORST), bins=np.geomspace(4, _WORST, 60), color="#345c8c")
+    axes.set_xscale("log")
+    axes.set_xticks([4, 5, 7, 10, 20], ["4", "5", "7", "10", "≥ 20"])
+    axes.set_title(f"triangles; median {np.median(value):.2f}")
+    figure.colorbar(scale, cax=figure.add_axes((0.91, 0.2, 0.012, 0.6)), extend="max")
+    save_figure(figure, path)
+
+
+def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> None:
+    """The way from source to target: five pictures in a row, and a GIF that goes to and fro."""
+    s = f.source.surface
+    both = np.concatenate([s.vertices, f.aligned_image])
+    frame = View(s.vertices, 8).frame
+
+    def draw(t: float, size: int) -> np.ndarray:
+        view = View(both, size, frame=frame)
+        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv))).astype(np.uint8)
+
+    row = np.concatenate([draw(t, _STRIP) for t in np.linspace(0, 1, 5)], axis=1)
+    data = io.BytesIO()
+    Image.fromarray(row).save(data, format="PNG")
+    atomic_write(strip, data.getvalue())
+    frames = [Image.fromarray(draw(t, _GIF)) for t in np.linspace(0, 1, 13)]
+    frames += frames[-2:0:-1]
+    data = io.BytesIO()
+    frames[0].save(data, format="GIF", save_all=True, append_images=frames[1:], duration=90, loop=0)
+    atomic_write(animation, data.getvalue())
+
+
+def map_image(source: Surface, target: Surface, image_uv: np.ndarray) -> np.ndarray:
+    """A quick picture (384, 384, 3) uint8: the source's checkerboard where h puts it."""
+    image = locate(image_uv, target.uv, target.faces).take(target.vertices, target.faces)
+    view = View(target.vertices, 384)
+    return np.round(255 * view.draw(image, source.faces, checked(source.uv))).astype(np.uint8)

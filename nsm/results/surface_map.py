@@ -1,0 +1,200 @@
+"""Maps between surfaces: where points go, and what they carry along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from nsm.maps import Rotated, build_planar
+from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.metrics import evaluate
+from nsm.surfaces import Surface
+from nsm.surfaces.location import Places, locate
+
+FORMAT = "nsm-surface-map"
+VERSION = 1
+STEM = "pair"
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMap:
+    """A map f from one surface to another, f∘φ = ψ∘h.
+
+    Points are in the units and place of the mesh files. Values are looked up on the meshes
+    themselves; the networks φ and ψ only served to find h.
+
+    Attributes:
+        source, target: the neural surfaces φ and ψ.
+        map: h, from the source's domain to the target's, frozen.
+        landmarks: (L, 2) vertices of the two mesh files.
+        metrics: figures of :func:`nsm.results.pair_metrics`.
+        config: the settings of the run that made it.
+    """
+
+    source: NeuralSurface
+    target: NeuralSurface
+    map: nn.Module
+    landmarks: np.ndarray
+    metrics: dict[str, float] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.
+
+        Points off the source start from the nearest point on it.
+        """
+        s, t = self.source.surface, self.target.surface
+        normalised = (np.asarray(points, dtype=np.float64) - s.center) * s.scale
+        uv = locate(normalised, s.vertices, s.faces).take(s.uv, s.faces)
+        return self.target.in_original_units(_lifted(t, evaluate(self.map, uv)))
+
+    @cached_property
+    def image_uv(self) -> np.ndarray:
+        """h at the source's vertices: (V, 2) in the target's domain."""
+        return evaluate(self.map, self.source.surface.uv)
+
+    @cached_property
+    def image(self) -> np.ndarray:
+        """Where the source's vertices (of the cut mesh) go: (V, 3) on the target, normalised."""
+        return _lifted(self.target.surface, self.image_uv)
+
+    @cached_property
+    def _forth(self) -> Places:
+        return locate(self.image_uv, self.target.surface.uv, self.target.surface.faces)
+
+    @cached_property
+    def _back(self) -> Places:
+        return locate(self.target.surface.uv, self.image_uv, self.source.surface.faces)
+
+    @cached_property
+    def source_uv(self) -> np.ndarray:
+        """h⁻¹ at the target's vertices (of the cut mesh): (V, 2) in the source's domain."""
+        return self._back.take(self.source.surface.uv, self.source.surface.faces)
+
+    def transfer(self, values: np.ndarray, *, back: bool = False) -> np.ndarray:
+        """Carry values at the source's vertices over to the target's, or back.
+
+        Args:
+            values: (V, ...) a row for each vertex of the mesh file; whole numbers are taken for
+                labels, which are picked instead of interpolated.
+            back: from the target to the source.
+
+        Returns:
+            (W, ...) a row for each vertex of the other mesh file (see :func:`by_file_vertex`).
+
+        Raises:
+            ValueError: too few rows for the mesh.
+        """
+        start, end = self.source.surface, self.target.surface
+        places = self._back
+        if back:
+            start, end, places = end, start, self._forth
+        inner = on_cut_mesh(start, np.asarray(values))
+        if np.issubdtype(inner.dtype, np.integer) or inner.dtype == bool:
+            best = places.weights.argmax(axis=1)
+            moved = inner[start.faces[places.face, best]]
+        else:
+            moved = places.take(inner, start.faces)
+        return by_file_vertex(end, moved)
+
+    def morph(self, t: float) -> np.ndarray:
+        """Vertices (V, 3) on the straight way from the source (t = 0) to the target (t = 1).
+
+        Normalised units; the target is first turned and moved to lie best on the source.
+        """
+        return (1 - t) * self.source.surface.vertices + t * self.aligned_image
+
+    @cached_property
+    def aligned_image(self) -> np.ndarray:
+        """The image (V, 3), turned and moved (a rigid motion) to lie best on the source."""
+        return self.aligned(self.image)
+
+    def aligned(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) near the target, normalised, under that rigid motion (Kabsch)."""
+        image, reference = self.image, self.source.surface.vertices
+        p, q = image.mean(axis=0), reference.mean(axis=0)
+        u, _, vt = np.linalg.svd((image - p).T @ (reference - q))
+        flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+        return (points - p) @ (u @ flip @ vt) + q
+
+    def save(self, folder: str | Path) -> None:
+        """Write the map into a folder, and its surfaces into ``source`` and ``target`` there.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        place = Path(folder)
+        save_surface(place / "source", self.source)
+        save_surface(place / "target", self.target)
+        tensors = {k: v.contiguous() for k, v in self.map.state_dict().items()}
+        words = {
+            "map": self.map.inner.config,  # type: ignore[union-attr]
+            "landmarks": self.landmarks.tolist(),
+            "metrics": self.metrics,
+            "config": self.config,
+        }
+        write_pair(place / STEM, FORMAT, VERSION, tensors, words)
+
+
+def load_surface_map(folder: str | Path) -> SurfaceMap:
+    """Read what :meth:`SurfaceMap.save` wrote.
+
+    Raises:
+        NsmError: files that are missing, truncated, damaged, or of another version.
+    """
+    place = Path(folder)
+    tensors, words = read_pair(place / STEM, FORMAT, VERSION)
+    source, target = load_surface(place / "source"), load_surface(place / "target")
+    try:
+        h = Rotated(build_planar(words["map"]), torch.eye(2))
+        h.load_state_dict(tensors)
+        landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, 2)
+        metrics, config = dict(words["metrics"]), dict(words["config"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise misfit(place / STEM, error) from error
+    h.eval().requires_grad_(False)
+    return SurfaceMap(source, target, h, landmarks, metrics, config)
+
+
+def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
+    """Values at the cut mesh's vertices (V, ...) as values at the mesh file's (W, ...).
+
+    Of a seam vertex the first copy counts; a vertex of the file that is not on the surface (merged
+    or unreferenced) has the value of the one with the nearest number that is.
+    """
+    known = np.flatnonzero(surface.source_vertex >= 0)[::-1]
+    row = np.full(int(surface.source_vertex.max()) + 1, -1)
+    row[surface.source_vertex[known]] = known
+    present = np.flatnonzero(row >= 0)
+    nearest = present[np.searchsorted(present, np.arange(len(row))).clip(max=len(present) - 1)]
+    return values[row[nearest]]
+
+
+def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
+    """Values at the mesh file's vertices (W, ...) as values at the cut mesh's (V, ...).
+
+    Vertices that were inserted between others get what these have: the mean, or a label.
+    """
+    needed = int(surface.source_vertex.max()) + 1
+    if values.ndim == 0 or len(values) < needed:
+        rows = 0 if values.ndim == 0 else len(values)
+        raise ValueError(f"{surface.name} has {needed} vertices, but {rows} rows were given")
+    result = values[np.maximum(surface.source_vertex, 0)]
+    inserted = np.flatnonzero(surface.source_vertex < 0)
+    whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool
+    for vertex in inserted.tolist():
+        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
+        around = around[surface.source_vertex[around] >= 0]
+        result[vertex] = result[around[0]] if whole else result[around].mean(axis=0)
+    return result
+
+
+def _lifted(surface: Surface, uv: np.ndarray) -> np.ndarray:
+    return locate(uv, surface.uv, surface.faces).take(surface.vertices, surface.faces)

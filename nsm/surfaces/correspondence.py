@@ -1,0 +1,257 @@
+"""Seams that correspond: closed shapes cut through their landmarks, all in the same way.
+
+The seam is a tree whose nodes are landmarks and whose branches are shortest paths on each mesh.
+Branches meet at landmarks only, and leave each landmark in the same cyclic order on every mesh:
+then the walk around the seam passes the landmarks in the same order everywhere, and a map of one
+disc to another that keeps to that order is a map of the closed shapes.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+
+# A sector at a landmark: the branch after which, counter-clockwise, it comes; -1 with no branch.
+_WHOLE = -1
+
+
+@dataclass
+class _Tracer:
+    """Paths on one closed mesh (V, 3), (F, 3) between landmarks (L,), disjoint but for ends."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    landmarks: np.ndarray
+    cost: np.ndarray  # (E,) of walking along each edge
+    # per landmark: the branch number of each first vertex on the way out
+    spokes: list[dict[int, int]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.edges = topology.edges_of(self.faces).pairs
+        self.taken = np.zeros(len(self.vertices), dtype=bool)
+        self.taken[self.landmarks] = True
+        self.spokes = [{} for _ in self.landmarks]
+        self.rings = [_ring(self.faces, int(v)) for v in self.landmarks]
+
+    def distances(self) -> np.ndarray:
+        """(L, L) costs of the cheapest paths between landmarks, were nothing in the way."""
+        n = len(self.vertices)
+        graph = csr_matrix((self.cost, tuple(self.edges.T)), shape=(n, n))
+        return dijkstra(graph, directed=False, indices=self.landmarks)[:, self.landmarks]
+
+    def sectors(self, landmark: int) -> dict[int, list[int]]:
+        """Neighbours of a landmark by sector, along which a further branch may leave."""
+        ring, spokes = self.rings[landmark], self.spokes[landmark]
+        if not spokes:
+            return {_WHOLE: ring}
+        start = next(k for k, v in enumerate(ring) if v in spokes)
+        result: dict[int, list[int]] = {}
+        current = -1
+        for vertex in ring[start:] + ring[:start]:
+            if vertex in spokes:
+                current = spokes[vertex]
+                result[current] = []
+            else:
+                result[current].append(vertex)
+        return result
+
+    def path(self, i: int, j: int, leave: list[int], arrive: list[int]) -> tuple[float, list[int]]:
+        """The cheapest free path between landmarks i and j, and its cost (inf if there is none).
+
+        Its second vertex is one of ``leave`` (or j itself), its last but one of ``arrive``.
+        """
+        a, b = int(self.landmarks[i]), int(self.landmarks[j])
+        x, y = self.edges.T
+        keep = ~self.taken[x] & ~self.taken[y]
+        for end, gates, other in ((a, leave, b), (b, arrive, a)):
+            far = np.where(x == end, y, x)
+            touches = (x == end) | (y == end)
+            keep |= touches & np.isin(far, gates) & ~self.taken[far]
+            if other in gates and end in (arrive if other == b else leave):
+                keep |= touches & (far == other)
+        n = len(self.vertices)
+        graph = csr_matrix((self.cost[keep], (x[keep], y[keep])), shape=(n, n))
+        distance, before = dijkstra(graph, directed=False, indices=a, return_predecessors=True)
+        if not np.isfinite(distance[b]):
+            return float("inf"), []
+        path = [b]
+        while path[-1] != a:
+            path.append(int(before[path[-1]]))
+        return float(distance[b]), path[::-1]
+
+    def lay(self, branch: int, i: int, j: int, path: list[int]) -> None:
+        """Take a path as a branch of the seam."""
+        self.taken[path] = True
+        self.spokes[i][path[1]] = branch
+        self.spokes[j][path[-2]] = branch
+
+
+def _ring(faces: np.ndarray, vertex: int) -> list[int]:
+    """The neighbours of an inner vertex, counter-clockwise."""
+    following: dict[int, int] = {}
+    for face in faces[(faces == vertex).any(axis=1)]:
+        k = int(np.flatnonzero(face == vertex)[0])
+        following[int(face[(k + 1) % 3])] = int(face[(k + 2) % 3])
+    first = next(iter(following))
+    ring = [first]
+    while following[ring[-1]] != first:
+        ring.append(following[ring[-1]])
+    return ring
+
+
+def corresponding_paths(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]],
+    landmarks: Sequence[np.ndarray],
+    costs: Sequence[np.ndarray] | None = None,
+    avoid: Sequence[np.ndarray] | None = None,
+) -> list[list[list[int]]]:
+    """For each mesh, the L - 1 branches of one tree through all of its landmarks.
+
+    Args:
+        meshes: closed genus-0 manifolds, (V, 3) and (F, 3) each.
+        landmarks: (L,) different vertices of each mesh, L at least 2, in the same order.
+        costs: what walking along each edge (of :func:`topology.edges_of`) costs; its length by
+            default.
+        avoid: further vertices of each mesh that no branch may touch.
+
+    Returns:
+        Per mesh, the branches as lists of vertices; branch b joins the same landmarks everywhere.
+
+    Raises:
+        NsmError: no tree was found (landmarks too close for the mesh's edges).
+    """
+    tracers = []
+    for m, (vertices, faces) in enumerate(meshes):
+        unit = np.sqrt(topology.face_areas(vertices, faces).sum())
+        cost = edge_lengths(vertices, faces) if costs is None else costs[m]
+        tracers.append(_Tracer(vertices, faces, np.asarray(landmarks[m]), cost / unit))
+        if avoid is not None:
+            tracers[-1].taken[avoid[m]] = True
+    mean = np.sum([t.distances() for t in tracers], axis=0)
+    count = len(landmarks[0])
+    queue = [(float(mean[i, j]), i, j) for i, j in itertools.combinations(range(count), 2)]
+    heapq.heapify(queue)
+    component = list(range(count))
+    branches: list[list[list[int]]] = [[] for _ in meshes]
+    while len(branches[0]) < count - 1:
+        if not queue:
+            raise NsmError(
+                "no seams through all landmarks were found: some are too close together for the "
+                "meshes' edges; leave one of them out, or subdivide the mesh"
+            )
+        _, i, j = heapq.heappop(queue)
+        if component[i] == component[j]:
+            continue
+        total, paths = _cheapest(tracers, i, j)
+        if not np.isfinite(total):
+            continue
+        if queue and total > queue[0][0] + 1e-12:
+            heapq.heappush(queue, (total, i, j))  # others may have become the shorter ones
+            continue
+        for tracer, laid, path in zip(tracers, branches, paths, strict=True):
+            tracer.lay(len(laid), i, j, path)
+            laid.append(path)
+        old, new = component[j], component[i]
+        component = [new if c == old else c for c in component]
+    return branches
+
+
+def _cheapest(tracers: Sequence[_Tracer], i: int, j: int) -> tuple[float, list[list[int]]]:
+    """The paths from i to j, one per mesh, in the same sectors, that are cheapest in sum."""
+    best: tuple[float, list[list[int]]] = (float("inf"), [])
+    for s, t in itertools.product(tracers[0].sectors(i), tracers[0].sectors(j)):
+        total, paths = 0.0, []
+        for tracer in tracers:
+            cost, path = tracer.path(i, j, tracer.sectors(i)[s], tracer.sectors(j)[t])
+            total += cost
+            paths.append(path)
+            if total >= best[0]:
+                break
+        else:
+            best = (total, paths)
+    return best
+
+
+SEAMS = ("shortest", "hidden")
+_VISIBLE_COST = 3.0  # how much dearer an edge is that is seen from all sides
+
+
+def seam_costs(vertices: np.ndarray, faces: np.ndarray, seam: str) -> np.ndarray:
+    """What it costs a seam to go along each edge (E,).
+
+    Args:
+        vertices, faces: the mesh (V, 3), (F, 3).
+        seam: ``shortest``, the edge's length; or ``hidden``, more for edges that are seen from
+            many sides (after Sheffer and Hart 2002, "Seamster").
+
+    Raises:
+        NsmError: another word.
+    """
+    length = edge_lengths(vertices, faces)
+    if seam == "shortest":
+        return length
+    if seam != "hidden":
+        raise NsmError(f"seam={seam} is not one of {', '.join(SEAMS)}")
+    import igl
+
+    normals = igl.per_vertex_normals(vertices, faces)
+    hidden = np.asarray(igl.ambient_occlusion(vertices, faces, vertices, normals, 200)).ravel()
+    visible = 1 - hidden[topology.edges_of(faces).pairs].mean(axis=1)
+    return length * (1 + _VISIBLE_COST * visible)
+
+
+def mutually_far(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]],
+    landmarks: Sequence[np.ndarray],
+    count: int | None,
+) -> np.ndarray:
+    """Numbers of ``count`` landmarks that are far from each other on all meshes, ascending."""
+    total = len(landmarks[0])
+    if count is None or count >= total:
+        return np.arange(total)
+    distance = np.zeros((total, total))
+    for (vertices, faces), ids in zip(meshes, landmarks, strict=True):
+        unit = np.sqrt(topology.face_areas(vertices, faces).sum())
+        cost = edge_lengths(vertices, faces) / unit
+        distance += _Tracer(vertices, faces, np.asarray(ids), cost).distances()
+    chosen = [int(k) for k in np.unravel_index(distance.argmax(), distance.shape)]
+    while len(chosen) < count:
+        chosen.append(int(distance[chosen].min(axis=0).argmax()))
+    return np.sort(np.array(chosen, dtype=np.int64))
+
+
+def edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Lengths (E,) of the edges of :func:`topology.edges_of`."""
+    pairs = topology.edges_of(faces).pairs
+    return np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+
+
+def boundary_keys(origin: np.ndarray, loop: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """(K, 2) int64: the landmark's number, and the cut vertex, of each copy of a landmark on the
+    boundary loop (B,), in the loop's order."""
+    number = {int(v): k for k, v in enumerate(landmarks)}
+    rows = [(number[o], int(v)) for v in loop if (o := int(origin[v])) in number]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def turned_alike(keys: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+    """The keys (K, 2) of several loops, each turned so that their landmarks come in the order of
+    the first; None where that cannot be."""
+    first = keys[0][:, 0].tolist()
+    result = [keys[0]]
+    for other in keys[1:]:
+        order = other[:, 0].tolist()
+        turn = next((k for k in range(len(order)) if order[k:] + order[:k] == first), None)
+        if len(order) != len(first) or (turn is None and first):
+            return None
+        result.append(np.roll(other, -(turn or 0), axis=0))
+    return result

@@ -1,0 +1,263 @@
+"""Several meshes prepared together, so that their domains correspond."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nsm.errors import NsmError
+from nsm.surfaces import cache as cache_
+from nsm.surfaces import topology
+from nsm.surfaces.correspondence import (
+    boundary_keys,
+    corresponding_paths,
+    mutually_far,
+    seam_costs,
+    turned_alike,
+)
+from nsm.surfaces.cutting import Cut, cut_along_paths
+from nsm.surfaces.parameterization import (
+    DOMAIN_AREA,
+    Keys,
+    at_fractions,
+    fractions_of,
+    parameterize,
+)
+from nsm.surfaces.surface import Surface
+from nsm.surfaces.validation import CleanMesh, clean
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh as read: name, vertices (V, 3), faces (F, 3), and a line for each thing noted."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    log: tuple[str, ...] = ()
+
+
+def prepare_together(
+    meshes: Sequence[Mesh],
+    landmarks: Sequence[np.ndarray],
+    *,
+    domain: str = "disc",
+    parameterization: str = "slim",
+    seam: str = "shortest",
+    seam_landmarks: int | None = None,
+    cache: bool = True,
+) -> list[Surface]:
+    """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
+
+    Closed genus-0 meshes with two landmarks or more are cut along corresponding seams, and the
+    landmarks on the seam get the same places on ∂Ω in all of them. Other meshes are prepared one
+    by one.
+
+    Args:
+        meshes: two or more.
+        landmarks: (L,) vertices of each, in the same order.
+        domain, parameterization, cache: as for :meth:`Surface.load`.
+        seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides.
+        seam_landmarks: how many landmarks, mutually far ones, the seam passes through; all of
+            them by default.
+
+    Raises:
+        NsmError: a mesh that cannot be prepared, or no corresponding seams.
+    """
+    cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
+    found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
+    closed = all(
+        topology.euler_characteristic(c.faces) == 2 and not topology.boundary_loops(c.faces)
+        for c in cleaned
+    )
+    if not closed or len(found[0]) < 2:
+        return [
+            Surface.from_arrays(
+                m.vertices,
+                m.faces,
+                name=m.name,
+                domain=domain,
+                parameterization=parameterization,
+                cache=cache,
+                log=m.log,
+            )
+            for m in meshes
+        ]
+    digest = hashlib.sha256()
+    for c, ids in zip(cleaned, found, strict=True):
+        for array in (c.vertices, c.faces, ids):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    options = {
+        "together": digest.hexdigest(),
+        "domain": domain,
+        "method": parameterization,
+        "seam": [seam, seam_landmarks],
+    }
+    names = [cache_.preparation_key(c.vertices, c.faces, options) for c in cleaned]
+    if cache:
+        stored = [cache_.read(key) for key in names]
+        if all(s is not None for s in stored):
+            return [
+                Surface.from_stored(m.name, domain, s)
+                for m, s in zip(meshes, stored, strict=True)
+                if s is not None
+            ]
+    surfaces = _cut_alike(meshes, cleaned, found, domain, parameterization, seam, seam_landmarks)
+    if cache:
+        for key, surface in zip(names, surfaces, strict=True):
+            cache_.write(key, surface.to_stored())
+    return surfaces
+
+
+def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
+    """Landmarks as vertices of the cleaned mesh."""
+    kept = mesh.merged[landmarks]
+    for given, vertex in zip(landmarks, kept, strict=True):
+        if vertex < 0:
+            raise NsmError(f"{name}: landmark {given} is not on the surface; give another vertex")
+    return kept
+
+
+def _cut_alike(
+    meshes: Sequence[Mesh],
+    cleaned: Sequence[CleanMesh],
+    landmarks: Sequence[np.ndarray],
+    domain: str,
+    method: str,
+    seam: str,
+    seam_landmarks: int | None,
+) -> list[Surface]:
+    pairs = [(c.vertices, c.faces) for c in cleaned]
+    costs = [seam_costs(vertices, faces, seam) for vertices, faces in pairs]
+    chosen = mutually_far(pairs, landmarks, seam_landmarks)
+    on_seam = [ids[chosen] for ids in landmarks]
+    paths = corresponding_paths(pairs, on_seam, costs, avoid=landmarks)
+    cuts = [
+        cut_along_paths(c.vertices, c.faces, p, name=m.name)
+        for c, p, m in zip(cleaned, paths, meshes, strict=True)
+    ]
+    keys = turned_alike(
+        [boundary_keys(cut.origin, cut.loop, ids) for cut, ids in zip(cuts, on_seam, strict=True)]
+    )
+    assert keys is not None, "branches in the same cyclic order make equal walks"
+    fractions = common_fractions(cuts, [k[:, 1] for k in keys], domain)
+    words = f"seam led through {len(chosen)} of {len(landmarks[0])} landmarks, alike on all meshes"
+    return [
+        Surface.from_cut(
+            cut,
+            c.source_vertex,
+            name=m.name,
+            domain=domain,
+            parameterization=method,
+            keys=Keys(k[:, 1], fractions),
+            log=(*m.log, *c.log, words),
+        )
+        for m, c, cut, k in zip(meshes, cleaned, cuts, keys, strict=True)
+    ]
+
+
+def common_fractions(cuts: Sequence[Cut], keys: Sequence[np.ndarray], domain: str) -> np.ndarray:
+    """Places (K,) on ∂Ω, as fractions of the way around, that suit the keys of all discs.
+
+    Each disc is flattened with its boundary free to slide; the gaps between its keys are averaged
+    over the discs. On the square the keys nearest to the corners become the corners.
+    """
+    gaps = []
+    for cut, key in zip(cuts, keys, strict=True):
+        area = topology.face_areas(cut.vertices, cut.faces).sum()
+        unit = cut.vertices * np.sqrt(DOMAIN_AREA["disc"] / area)
+        uv = parameterize(unit, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
+        angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
+        gaps.append((np.roll(angle, -1) - angle) % 1.0)
+    mean = np.mean(gaps, axis=0)
+    fractions = np.concatenate([[0.0], np.cumsum(mean / mean.sum())[:-1]])
+    return _through_corners(fractions) if domain == "square" else fractions
+
+
+def _through_corners(fractions: np.ndarray) -> np.ndarray:
+    """Fractions (K,) warped so that four keys near the quarters come to be the corners."""
+    count = len(fractions)
+    if count < 4:
+        return fractions
+    corners = [0]
+    for quarter in (1, 2, 3):
+        nearest = int(np.abs(fractions - quarter / 4).argmin())
+        # each corner needs a key of its own
+        corners.append(min(max(nearest, corners[-1] + 1), count - 4 + quarter))
+    return np.interp(fractions, [*fractions[corners], 1.0], [0.0, 0.25, 0.5, 0.75, 1.0])
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Landmarks found in the domains of several surfaces.
+
+    points: (K, 2) in Ω, one array per surface; numbers: (K,) which landmark each is. The first
+    ``on_boundary`` lie on ∂Ω, in the order in which it is walked counter-clockwise; a landmark on
+    the seam is there once for each time that the walk passes it.
+    """
+
+    points: list[np.ndarray]
+    numbers: np.ndarray
+    on_boundary: int
+
+    def seam(self, domain: str, count: int) -> np.ndarray:
+        """(T, 2, 2) pairs of points of ∂Ω that are one point of each surface, if cut alike.
+
+        Between the landmarks at its ends, each branch of the seam is walked along twice, there
+        and back; ``count`` points of the way there are paired with those of the way back, by
+        their shares of the ways. Nothing is paired where the walk is not around a tree.
+        """
+        numbers = self.numbers[: self.on_boundary].tolist()
+        t = fractions_of(self.points[0][: self.on_boundary], domain)
+        ways = {
+            (numbers[k], numbers[(k + 1) % len(numbers)]): (
+                t[k],
+                (t[(k + 1) % len(numbers)] - t[k]) % 1.0 or 1.0,
+            )
+            for k in range(len(numbers))
+        }
+        share = (np.arange(count) + 0.5) / count
+        pairs = []
+        for (a, b), (begin, span) in ways.items():
+            if a < b and (b, a) in ways:
+                back, width = ways[b, a]
+                there = at_fractions((begin + span * share) % 1.0, domain)
+                pairs.append(
+                    np.stack([there, at_fractions((back + width * (1 - share)) % 1.0, domain)], 1)
+                )
+        return np.concatenate(pairs) if pairs else np.zeros((0, 2, 2))
+
+
+def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray]) -> Matched:
+    """Corresponding points in the domains of surfaces.
+
+    A landmark on the seam has several preimages on ∂Ω; they correspond in the order in which the
+    boundary passes them.
+
+    Args:
+        surfaces: all of one domain.
+        landmarks: vertices (L,) of each one's mesh file.
+
+    Raises:
+        NsmError: a landmark that a surface does not have, or boundaries that do not correspond.
+    """
+    keys = [
+        boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], ids)
+        for s, ids in zip(surfaces, landmarks, strict=True)
+    ]
+    alike = turned_alike(keys)
+    if alike is None:
+        names = " and ".join(s.name for s in surfaces)
+        raise NsmError(
+            f"the boundaries of {names}, once cut, pass the landmarks differently; give meshes "
+            "instead of ready surfaces, so that they are cut alike, or other landmarks"
+        )
+    inner = np.setdiff1d(np.arange(len(landmarks[0])), keys[0][:, 0])
+    points = [
+        np.concatenate([s.uv[key[:, 1]], s.preimages(ids[inner].tolist())])
+        for s, key, ids in zip(surfaces, alike, landmarks, strict=True)
+    ]
+    return Matched(points, np.concatenate([alike[0][:, 0], inner]), len(alike[0]))

@@ -1,0 +1,73 @@
+"""Planar maps: identity at the start, on the boundary by construction, Jacobians."""
+
+import pytest
+import torch
+from torch.func import jacrev, vmap
+
+from nsm.energies import signed_distance
+from nsm.maps import build_planar
+
+SMALL = {"width": 8, "depth": 1, "activation": {"name": "tanh"}}
+KINDS = [None, "disc", "square"]
+
+
+def stirred(onto, scale=0.3):
+    torch.manual_seed(0)
+    h = build_planar({**SMALL, "onto": onto}).double()
+    for p in h.network.output.parameters():
+        torch.nn.init.normal_(p, std=scale)
+    return h
+
+
+def points(n=64):
+    torch.manual_seed(1)
+    return (2 * torch.rand(n, 2, dtype=torch.float64) - 1) * 0.7
+
+
+@pytest.mark.parametrize("onto", KINDS)
+def test_it_starts_as_the_identity(onto):
+    h = build_planar({**SMALL, "onto": onto}).double()
+    value, jacobian = h.value_and_jacobian(points())
+    assert (value - points()).abs().max() == 0
+    assert (jacobian - torch.eye(2)).abs().max() == 0
+
+
+@pytest.mark.parametrize("onto", KINDS)
+def test_jacobians_are_those_of_automatic_differentiation(onto):
+    h = stirred(onto)
+    value, jacobian = h.value_and_jacobian(points())
+    assert (value - h(points())).abs().max() < 1e-12
+    expected = vmap(jacrev(lambda x: h(x[None])[0]))(points())
+    assert (jacobian - expected).abs().max() < 1e-10
+
+
+def test_the_circle_goes_to_itself_and_slides():
+    h = stirred("disc")
+    t = torch.linspace(0, 6, 40, dtype=torch.float64)
+    rim = torch.stack([t.cos(), t.sin()], dim=1)
+    assert signed_distance("disc", h(rim)).abs().max() < 1e-12
+    assert (h(rim) - rim).abs().max() > 0.05
+
+
+def test_each_side_of_the_square_goes_to_itself_and_corners_stay():
+    h = stirred("square")
+    along = torch.linspace(-1, 1, 9, dtype=torch.float64)
+    side = torch.stack([torch.ones_like(along), along], dim=1)
+    for p in (side, -side, side.flip(1), -side.flip(1)):
+        fixed = (p[0] == p[1]).nonzero().item()
+        assert (h(p)[:, fixed] - p[:, fixed]).abs().max() < 1e-12
+        assert (h(p)[[0, -1]] - p[[0, -1]]).abs().max() < 1e-12
+    assert (h(side) - side).abs().max() > 0.02
+
+
+@pytest.mark.parametrize("onto", KINDS)
+def test_config_builds_the_same_kind(onto):
+    h = stirred(onto)
+    twin = build_planar(h.config).double()
+    twin.load_state_dict(h.state_dict())
+    assert (twin(points()) - h(points())).abs().max() == 0
+
+
+def test_other_domains_are_refused():
+    with pytest.raises(ValueError, match="triangle"):
+        build_planar({**SMALL, "onto": "triangle"})

@@ -1,0 +1,34 @@
+"""Points found on meshes."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nsm.surfaces import shapes
+from nsm.surfaces.location import locate
+
+
+@given(st.integers(0, 2**31))
+def test_a_point_of_a_triangle_is_found_there(seed):
+    random = np.random.default_rng(seed)
+    uv, faces = shapes.ring_mesh(6)
+    face = random.integers(len(faces), size=50)
+    weights = random.dirichlet(np.ones(3), size=50)
+    points = np.einsum("nk,nkd->nd", weights, uv[faces[face]])
+    places = locate(points, uv, faces)
+    assert np.abs(places.take(uv, faces) - points).max() < 1e-9
+    inside = weights.min(axis=1) > 1e-6
+    assert (places.face[inside] == face[inside]).all()
+
+
+def test_points_outside_go_to_the_nearest_place():
+    uv, faces = shapes.grid_mesh(5)
+    places = locate(np.array([[2.0, 0.25], [-3.0, 3.0]]), uv, faces)
+    assert np.abs(places.take(uv, faces) - [[1, 0.25], [-1, 1]]).max() < 1e-12
+
+
+def test_values_of_any_shape_are_interpolated():
+    vertices, faces = shapes.sphere(3)
+    places = locate(vertices[:10], vertices, faces)
+    values = np.arange(len(vertices) * 6, dtype=float).reshape(-1, 2, 3)
+    assert np.abs(places.take(values, faces) - values[:10]).max() < 1e-6

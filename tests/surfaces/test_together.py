@@ -1,0 +1,183 @@
+"""Meshes cut alike: corresponding seams, places on the boundary, and matched landmarks."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from nsm.errors import NsmError
+from nsm.surfaces import Surface, topology
+from nsm.surfaces.correspondence import (
+    boundary_keys,
+    corresponding_paths,
+    edge_lengths,
+    mutually_far,
+    seam_costs,
+    turned_alike,
+)
+from nsm.surfaces.cutting import cut_along_paths
+from nsm.surfaces.parameterization import at_fractions
+from nsm.surfaces.together import Mesh, matched_landmarks, prepare_together
+
+
+def ball(subdivisions=3):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def nearest(vertices, points):
+    return np.array([np.linalg.norm(vertices - p, axis=1).argmin() for p in np.array(points)])
+
+
+POINTS = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A ball, and the same stretched and finer, with six landmarks each."""
+    a, b = ball(3), ball(4)
+    stretched = b[0] * [1.0, 1.5, 0.8]
+    ids = [nearest(a[0], POINTS), nearest(b[0], POINTS)]
+    return [Mesh("ball", *a), Mesh("egg", stretched, b[1])], ids
+
+
+def test_branches_meet_at_landmarks_only_and_make_one_tree(pair):
+    meshes, ids = pair
+    paths = corresponding_paths([(m.vertices, m.faces) for m in meshes], ids)
+    for mesh_paths, landmarks in zip(paths, ids, strict=True):
+        inner = [v for p in mesh_paths for v in p[1:-1]]
+        assert len(set(inner)) == len(inner)
+        assert not set(inner) & set(landmarks.tolist())
+        assert len(mesh_paths) == len(landmarks) - 1
+    ends = [
+        [tuple(int(np.flatnonzero(own == p[k])[0]) for k in (0, -1)) for p in mesh_paths]
+        for mesh_paths, own in zip(paths, ids, strict=True)
+    ]
+    assert ends[0] == ends[1]
+
+
+def test_the_walk_around_the_seam_passes_landmarks_in_the_same_order(pair):
+    meshes, ids = pair
+    paths = corresponding_paths([(m.vertices, m.faces) for m in meshes], ids)
+    keys = []
+    for mesh, path, landmarks in zip(meshes, paths, ids, strict=True):
+        cut = cut_along_paths(mesh.vertices, mesh.faces, path)
+        assert topology.is_disc(cut.faces)
+        keys.append(boundary_keys(cut.origin, cut.loop, landmarks))
+    assert len(keys[0]) == 2 * (len(POINTS) - 1)  # each branch is walked along twice
+    alike = turned_alike(keys)
+    assert alike is not None
+    assert (alike[0][:, 0] == alike[1][:, 0]).all()
+
+
+def test_walks_in_other_orders_are_not_alike():
+    walk = np.array([[0, 5], [1, 6], [2, 7]])
+    assert turned_alike([walk, walk[[0, 2, 1]]]) is None
+    turned = turned_alike([walk, np.roll(walk, 1, axis=0)])
+    assert turned is not None and (turned[1] == walk).all()
+
+
+@pytest.mark.parametrize("domain", ["disc", "square"])
+def test_landmarks_on_the_seam_have_the_same_place_in_all_domains(pair, domain):
+    meshes, ids = pair
+    surfaces = prepare_together(meshes, ids, domain=domain, cache=False)
+    p, q = matched_landmarks(surfaces, ids).points
+    assert len(p) == 2 * (len(POINTS) - 1)
+    assert np.abs(p - q).max() < 1e-12
+    norm = np.linalg.norm(p, ord=2 if domain == "disc" else np.inf, axis=1)
+    assert np.abs(norm - 1).max() < 1e-12
+    for surface in surfaces:
+        assert surface.quality["flipped_triangles"] == 0
+    if domain == "square":  # four keys have become the corners
+        assert (np.abs(p).min(axis=1) > 1 - 1e-12).sum() == 4
+
+
+def test_the_seam_keeps_off_landmarks_that_it_does_not_pass_through(pair):
+    meshes, ids = pair
+    surfaces = prepare_together(meshes, ids, seam_landmarks=3, cache=False)
+    p, _ = matched_landmarks(surfaces, ids).points
+    inner = np.linalg.norm(p, axis=1) < 1 - 1e-9
+    assert inner.sum() == len(POINTS) - 3
+
+
+def test_prepared_surfaces_are_taken_from_the_cache(pair):
+    meshes, ids = pair
+    first = prepare_together(meshes, ids)
+    second = prepare_together(meshes, ids)
+    assert "prepared surface taken from the cache" in second[1].log
+    assert (first[1].uv == second[1].uv).all()
+    other = prepare_together(meshes, [i[::-1] for i in ids], cache=True)
+    assert "prepared surface taken from the cache" not in other[1].log
+
+
+def test_open_meshes_are_left_whole():
+    surfaces = [Surface.load(name, cache=False) for name in ("hemisphere", "saddle")]
+    meshes = [Mesh(s.name, s.vertices, s.faces) for s in surfaces]
+    together = prepare_together(meshes, [np.array([500, 600])] * 2, cache=False)
+    for surface in together:
+        assert len(surface.twins) == 0
+    p, q = matched_landmarks(together, [np.array([500, 600])] * 2).points
+    assert p.shape == q.shape == (2, 2)
+
+
+def test_seams_that_do_not_correspond_are_refused(pair):
+    meshes, ids = pair
+    surfaces = [
+        Surface.from_arrays(m.vertices, m.faces, name=m.name, seam_vertices=s)
+        for m, s in zip(meshes, ([*ids[0][:3]], [*ids[1][1:4]]), strict=True)
+    ]
+    with pytest.raises(NsmError, match="pass the landmarks differently"):
+        matched_landmarks(surfaces, ids)
+
+
+def test_hidden_seams_cost_more_where_a_surface_is_seen():
+    vertices, faces = ball()
+    length = edge_lengths(vertices, faces)
+    # nothing hides a convex shape
+    assert np.allclose(seam_costs(vertices, faces, "hidden"), 4 * length, rtol=0.05)
+    assert (seam_costs(vertices, faces, "shortest") == length).all()
+    with pytest.raises(NsmError, match="seam=other"):
+        seam_costs(vertices, faces, "other")
+
+
+def test_mutually_far_landmarks_are_opposite_ones():
+    vertices, faces = ball()
+    chosen = mutually_far([(vertices, faces)], [nearest(vertices, POINTS)], 2)
+    assert abs(chosen[0] - chosen[1]) == 3
+    assert len(mutually_far([(vertices, faces)], [nearest(vertices, POINTS)], None)) == 6
+
+
+def test_fractions_run_counter_clockwise_from_corner_to_corner():
+    t = np.array([0.0, 0.125, 0.25, 0.5, 0.75])
+    expected = [[-1, -1], [0, -1], [1, -1], [1, 1], [-1, 1]]
+    assert np.abs(at_fractions(t, "square") - expected).max() < 1e-12
+    assert np.abs(at_fractions(t, "disc")[2] - [0, 1]).max() < 1e-12
+
+
+def test_the_animals_are_cut_alike(shared_meshes):
+    from nsm.surfaces.landmarks import read_landmarks
+    from nsm.surfaces.loading import load_mesh
+
+    names = ["shrec07-384", "shrec07-388"]
+    arrays = [load_mesh(shared_meshes / f"{n}.off")[:2] for n in names]
+    ids = [np.array(read_landmarks(shared_meshes / "landmarks" / f"{n}.vts")) for n in names]
+    paths = corresponding_paths(arrays, ids)
+    keys = []
+    for (vertices, faces), path, landmarks in zip(arrays, paths, ids, strict=True):
+        cut = cut_along_paths(vertices, faces, path)
+        keys.append(boundary_keys(cut.origin, cut.loop, landmarks))
+    assert turned_alike(keys) is not None
+
+
+def test_the_common_seam_glues_each_branch_to_its_way_back(pair):
+    meshes, ids = pair
+    surfaces = prepare_together(meshes, ids, cache=False)
+    matched = matched_landmarks(surfaces, ids)
+    seam = matched.seam("disc", 4)
+    assert seam.shape == (4 * (len(POINTS) - 1), 2, 2)
+    assert np.abs(np.linalg.norm(seam, axis=2) - 1).max() < 1e-12
+    # close to a key, both copies are close to keys of one landmark
+    keys, numbers = matched.points[0], matched.numbers
+    ends = matched.seam("disc", 1000)
+    first = [numbers[np.linalg.norm(keys - p, axis=1).argmin()] for p in ends[::1000, 0]]
+    second = [numbers[np.linalg.norm(keys - p, axis=1).argmin()] for p in ends[::1000, 1]]
+    assert first == second
