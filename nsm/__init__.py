@@ -12,9 +12,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nsm.api import load, map_pair, overfit, parameterize
+    from nsm.api import load, map_collection, map_pair, overfit, parameterize
     from nsm.errors import NsmError
-    from nsm.results import NeuralSurface, Parameterization, SurfaceMap
+    from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
     from nsm.surfaces import Surface, catalogue_names
 
 __all__ = [
@@ -22,9 +22,11 @@ __all__ = [
     "NsmError",
     "Parameterization",
     "Surface",
+    "SurfaceCollection",
     "SurfaceMap",
     "catalogue_names",
     "load",
+    "map_collection",
     "map_pair",
     "overfit",
     "parameterize",
@@ -34,7 +36,9 @@ _HOME = {
     "NeuralSurface": "nsm.results",
     "NsmError": "nsm.errors",
     "Surface": "nsm.surfaces",
+    "SurfaceCollection": "nsm.results",
     "SurfaceMap": "nsm.results",
+    "map_collection": "nsm.api",
     "map_pair": "nsm.api",
     "catalogue_names": "nsm.surfaces",
     "load": "nsm.api",

@@ -11,11 +11,13 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nsm.config import compose_config
-from nsm.pipeline import run_overfit, run_pair_map, run_param
+from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
 from nsm.results import (
     NeuralSurface,
     Parameterization,
+    SurfaceCollection,
     SurfaceMap,
+    load_collection,
     load_parameterization,
     load_surface,
     load_surface_map,
@@ -125,6 +127,39 @@ def map_pair(
         return run_pair_map(config, place, source, target, landmarks)
 
 
+def map_collection(
+    surfaces: Sequence[NeuralSurface | str | Path],
+    landmarks: Any = None,
+    *,
+    overrides: Sequence[str] = (),
+    folder: str | Path | None = None,
+    progress: bool = True,
+) -> SurfaceCollection:
+    """Put three surfaces or more into correspondence, every one with every other.
+
+    Args:
+        surfaces: as for :func:`map_pair`.
+        landmarks: for each surface a list of vertices or points, or a file; or one JSON file.
+        overrides, folder, progress: as for :func:`map_pair`.
+
+    Returns:
+        The collection; ``collection.pair(i, j)`` is the map from one surface to another.
+
+    Raises:
+        NsmError: a surface, landmark or setting that cannot be used.
+
+    Examples:
+        >>> animals = nsm.map_collection(["a.off", "b.off", "c.off"], ["a.vts", "b.vts", "c.vts"])
+        >>> animals.pair(0, 2).transfer(colours)
+    """
+    words = ["task=collection_map", *overrides]
+    ready = [surface for surface in surfaces if isinstance(surface, NeuralSurface)]
+    if ready:
+        words.append(f"domain={ready[0].surface.domain}")
+    with _place(folder, words, progress) as (config, place):
+        return run_collection_map(config, place, surfaces, landmarks)
+
+
 @contextmanager
 def _place(
     folder: str | Path | None, words: list[str], progress: bool
@@ -139,7 +174,9 @@ def _place(
         yield compose_config([*words, "logger=none"]), Path(temporary)
 
 
-def load(folder: str | Path) -> NeuralSurface | Parameterization | SurfaceMap:
+def load(
+    folder: str | Path,
+) -> NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection:
     """Give back the result of a run.
 
     Args:
@@ -151,6 +188,8 @@ def load(folder: str | Path) -> NeuralSurface | Parameterization | SurfaceMap:
     Raises:
         NsmError: nothing there, or a file that is damaged or of another version.
     """
+    if (Path(folder) / "collection.json").exists():
+        return load_collection(folder)
     if (Path(folder) / "pair.json").exists():
         return load_surface_map(folder)
     if (Path(folder) / "map.json").exists():

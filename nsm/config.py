@@ -96,6 +96,7 @@ class Schema:
     surface: SurfaceSchema = field(default_factory=SurfaceSchema)
     source: Any = None
     target: Any = None
+    surfaces: Any = None
     landmarks: Any = None
     attributes: AttributesSchema = field(default_factory=AttributesSchema)
     seam: SeamSchema = field(default_factory=SeamSchema)
@@ -138,13 +139,21 @@ def register_resolvers() -> None:
 
 
 def _run_folder(
-    resume: str | None, task: str, name: str, path: str | None, source: Any, target: Any
+    resume: str | None,
+    task: str,
+    name: str,
+    path: str | None,
+    source: Any,
+    target: Any,
+    surfaces: Any,
 ) -> str:
     if resume is not None:
         return str(resume)
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     what = Path(path).stem if path else name
-    if target is not None:
+    if surfaces is not None:
+        what = "-".join(_called(surface) for surface in surfaces)
+    elif target is not None:
         what = "-".join(_called(end) for end in (source, target))
     folder = f"outputs/{task}/{what}-{stamp}"
     number, free = 2, folder

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsm.config import checked
 from nsm.errors import NsmError
+from nsm.pipeline.collection_map import run_collection_map
 from nsm.pipeline.common import CONFIG_FILE, quiet_lightning
 from nsm.pipeline.overfit import build_overfit, run_overfit
 from nsm.pipeline.pair_map import run_pair_map
@@ -20,6 +21,7 @@ __all__ = [
     "build_overfit",
     "quiet_lightning",
     "run",
+    "run_collection_map",
     "run_overfit",
     "run_pair_map",
     "run_param",
@@ -29,6 +31,7 @@ TASKS: dict[str, Callable[..., Any]] = {
     "overfit": run_overfit,
     "param": run_param,
     "pair_map": run_pair_map,
+    "collection_map": run_collection_map,
 }
 
 

@@ -92,19 +92,31 @@ def train(
     config: DictConfig,
     folder: Path,
     surface: Surface,
-    module: Any,
+    module: pl.LightningModule,
     console: Console,
     pictures: Pictures,
     *,
     resuming: bool,
     title: str | None = None,
 ) -> pl.Trainer:
-    """Train a module on samples of a surface in its run folder.
-
-    ``title`` stands beside the progress bar, the surface's name by default. KeyboardInterrupt if
-    the user stops it.
-    """
+    """:func:`fitted` on samples of one surface, whose name is the title by default."""
     data = OverfitData(surface, **plain(config)["data"], seed=config.seed)
+    words = f"{config.task.name} {title or surface.name}"
+    return fitted(config, folder, data, module, console, pictures, words, resuming=resuming)
+
+
+def fitted(
+    config: DictConfig,
+    folder: Path,
+    data: pl.LightningDataModule,
+    module: Any,
+    console: Console,
+    pictures: Pictures,
+    title: str,
+    *,
+    resuming: bool,
+) -> pl.Trainer:
+    """Train a module in its run folder; KeyboardInterrupt if the user stops it."""
     settings = config.trainer
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
@@ -114,9 +126,7 @@ def train(
     ]
     if settings.progress:
         shown = (module.progress_figure, module.progress_form)
-        callbacks.append(
-            TrainingProgress(console, f"{config.task.name} {title or surface.name}", *shown)
-        )
+        callbacks.append(TrainingProgress(console, title, *shown))
     logger: TensorBoardLogger | bool = False
     if config.logger.tensorboard:
         logger = TensorBoardLogger(save_dir=folder, name="", version="tensorboard")
@@ -163,7 +173,10 @@ def quiet_lightning() -> None:
 
 
 def _fit(
-    trainer: pl.Trainer, module: pl.LightningModule, data: OverfitData, checkpoint: Path | None
+    trainer: pl.Trainer,
+    module: pl.LightningModule,
+    data: pl.LightningDataModule,
+    checkpoint: Path | None,
 ) -> None:
     if checkpoint is None:
         trainer.fit(module, datamodule=data)

@@ -47,7 +47,9 @@ _INCIDENTAL = (
     "resume",
     "source",
     "target",
+    "surfaces",
     "landmarks",
+    "attributes",
     "seam",
     "constraints",
 )

@@ -2,6 +2,8 @@
 
 from nsm.results.analytic import analytic_surface
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.collection import SurfaceCollection, collection_metrics, load_collection
+from nsm.results.collection_pictures import figures_picture, transfer_matrix_picture
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh
@@ -22,10 +24,16 @@ from nsm.results.pictures import (
     reconstruction_image,
 )
 from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map
-from nsm.results.tables import comparison_table, metrics_table, pair_table
+from nsm.results.tables import collection_table, comparison_table, metrics_table, pair_table
 from nsm.results.textures import checkerboard
 
 __all__ = [
+    "SurfaceCollection",
+    "collection_metrics",
+    "collection_table",
+    "figures_picture",
+    "load_collection",
+    "transfer_matrix_picture",
     "SurfaceMap",
     "analytic_surface",
     "by_file_vertex",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from rich.table import Table
 
@@ -67,4 +68,27 @@ def pair_table(metrics: Mapping[str, float]) -> Table:
     table.columns[1].justify = "right"
     for key, (label, unit) in _PAIR_ROWS.items():
         table.add_row(label, f"{metrics[key]:.3f}", unit)
+    return table
+
+
+_COLLECTION_COLUMNS = {
+    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_percent": "flipped %",
+    "outside_percent": "outside %",
+    "landmark_error_max_percent": "landmark error, largest %",
+    "seam_gap_mean_percent": "seam gap, mean %",
+}
+
+
+def collection_table(metrics: Mapping[str, Any]) -> Table:
+    """The figures of :func:`nsm.results.collection_metrics`, a row for each ordered pair."""
+    table = Table("pair", *_COLLECTION_COLUMNS.values())
+    table.columns[0].no_wrap = True
+    for name, figures in metrics["pairs"].items():
+        table.add_row(name, *(f"{figures[key]:.3f}" for key in _COLLECTION_COLUMNS))
+    cycle = [metrics[f"cycle_error_{key}_percent"] for key in ("mean", "max")]
+    table.caption = (
+        f"cycle error {cycle[0]:.2g} % of the diagonal in the mean, {cycle[1]:.2g} % at most"
+    )
     return table

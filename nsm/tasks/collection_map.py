@@ -26,7 +26,7 @@ class CollectionMap(pl.LightningModule):
         map: configuration of each h_i's network.
         optimizer, scheduler, max_steps, domain, weights: as for :class:`nsm.tasks.PairMap`.
         lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam, boundary, landmarks,
-            multiplier_every: as there.
+            multiplier_every, ramp: as there.
         points: (K, 2) landmarks in the common domain.
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
@@ -54,6 +54,7 @@ class CollectionMap(pl.LightningModule):
         boundary: str,
         landmarks: str,
         multiplier_every: int,
+        ramp: float,
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
@@ -62,6 +63,8 @@ class CollectionMap(pl.LightningModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters(ignore=["phis", "points", "targets", "seam", "turns"])
+        if not 0 <= ramp <= 1:
+            raise ValueError(f"constraints.ramp {ramp} is not in [0, 1]")
         for value, known in ((boundary, BOUNDARIES), (landmarks, LANDMARKS)):
             if value not in known:
                 raise ValueError(f"{value!r} is not one of {', '.join(known)}")
@@ -72,7 +75,8 @@ class CollectionMap(pl.LightningModule):
             Rotated(build_planar({**map, "onto": onto}), turn) for turn in turns
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
-        self.domain, self.multiplier_every = domain, multiplier_every
+        self.domain = domain
+        self.multiplier_every, self.ramp_steps = multiplier_every, ramp * max_steps
         self.lambdas = {
             "injectivity": lambda_injectivity,
             "boundary": lambda_boundary,
@@ -81,6 +85,7 @@ class CollectionMap(pl.LightningModule):
         }
         self.register_buffer("points", points, persistent=False)
         self.register_buffer("targets", targets, persistent=False)
+        self.register_buffer("start", points @ turns.transpose(1, 2), persistent=False)
         self.register_buffer("seam", seam, persistent=False)
         self.register_buffer("rim", rim(domain), persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
@@ -89,6 +94,7 @@ class CollectionMap(pl.LightningModule):
 
     points: Tensor
     targets: Tensor
+    start: Tensor
     seam: Tensor
     rim: Tensor
     multipliers: Tensor
@@ -105,12 +111,14 @@ class CollectionMap(pl.LightningModule):
         loss = distortion
         if len(self.points):
             moved = self(self.points)
-            terms["landmarks"] = landmark(moved.flatten(0, 1), self.targets.flatten(0, 1)).sum()
-            loss = loss + (self.multipliers * (moved - self.targets)).sum()
+            wanted = self.start + self.ramped * (self.targets - self.start)
+            terms["landmarks"] = landmark(moved.flatten(0, 1), wanted.flatten(0, 1)).sum()
+            loss = loss + (self.multipliers * (moved - wanted)).sum()
         if len(self.seam) and self.lambdas["seam"] > 0:
             terms["seam"] = self._seam_gap()
         for name, value in terms.items():
-            loss = loss + self.lambdas[name] * value
+            share = self.ramped if name == "seam" else 1.0
+            loss = loss + share * self.lambdas[name] * value
             self.log(f"train/{name}", value)
         self.log("train/distortion", distortion)
         self.log("train/loss", loss)
@@ -143,7 +151,9 @@ class CollectionMap(pl.LightningModule):
         return total
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        if self.augmented and len(self.points) and self.global_step % self.multiplier_every == 0:
+        if not (self.augmented and len(self.points)) or self.ramped < 1:
+            return
+        if self.global_step % self.multiplier_every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
                 self.multipliers += 2 * self.lambdas["landmarks"] * off
@@ -153,6 +163,11 @@ class CollectionMap(pl.LightningModule):
         folded = 100 * (determinant <= 0).double().mean()
         self.log("val/distortion", distortion, batch_size=len(batch))
         self.log("val/folded_percent", folded, batch_size=len(batch))
+
+    @property
+    def ramped(self) -> float:
+        """How far, from 0 to 1, landmarks and seam have come on the way to their full demand."""
+        return min(1.0, self.global_step / self.ramp_steps) if self.ramp_steps else 1.0
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)

@@ -45,6 +45,8 @@ class PairMap(pl.LightningModule):
         boundary: ``exact`` or ``penalty``.
         landmarks: ``augmented`` or ``fixed``.
         multiplier_every: steps between two updates of the multipliers.
+        ramp: share of the steps in which the landmarks' targets move from where the start has
+            them to where they belong, and λ_seam grows from zero: pulled at once, h would fold.
         points, targets: landmarks P (L, 2) and Q (L, 2) in the domains of source and target.
         seam: (T, 2, 2) pairs of points of ∂Ω that are one point of the source, and whose images
             should be one point of the target.
@@ -72,6 +74,7 @@ class PairMap(pl.LightningModule):
         boundary: str,
         landmarks: str,
         multiplier_every: int,
+        ramp: float,
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
@@ -81,6 +84,8 @@ class PairMap(pl.LightningModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters(ignore=["phi", "psi", "points", "targets", "seam", "turn"])
+        if not 0 <= ramp <= 1:
+            raise ValueError(f"constraints.ramp {ramp} is not in [0, 1]")
         for value, known in ((boundary, BOUNDARIES), (landmarks, LANDMARKS)):
             if value not in known:
                 raise ValueError(f"{value!r} is not one of {', '.join(known)}")
@@ -98,15 +103,17 @@ class PairMap(pl.LightningModule):
             "landmarks": lambda_landmarks,
             "seam": lambda_seam,
         }
-        self.multiplier_every = multiplier_every
+        self.multiplier_every, self.ramp_steps = multiplier_every, ramp * max_steps
         self.register_buffer("points", points, persistent=False)
         self.register_buffer("targets", targets, persistent=False)
+        self.register_buffer("start", points @ turn.T, persistent=False)
         self.register_buffer("seam", seam, persistent=False)
         self.register_buffer("rim", rim(domain), persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(points))
 
     points: Tensor
     targets: Tensor
+    start: Tensor
     seam: Tensor
     rim: Tensor
     multipliers: Tensor
@@ -124,12 +131,14 @@ class PairMap(pl.LightningModule):
         loss = distortion
         if len(self.points):
             moved = self.map(self.points)
-            terms["landmarks"] = landmark(moved, self.targets).sum()
-            loss = loss + (self.multipliers * (moved - self.targets)).sum()
+            wanted = self.start + self.ramped * (self.targets - self.start)
+            terms["landmarks"] = landmark(moved, wanted).sum()
+            loss = loss + (self.multipliers * (moved - wanted)).sum()
         if len(self.seam) and self.lambdas["seam"] > 0:
             terms["seam"] = self._seam_gap()
         for name, value in terms.items():
-            loss = loss + self.lambdas[name] * value
+            share = self.ramped if name == "seam" else 1.0
+            loss = loss + share * self.lambdas[name] * value
             self.log(f"train/{name}", value)
         self.log("train/distortion", distortion)
         self.log("train/loss", loss)
@@ -152,7 +161,9 @@ class PairMap(pl.LightningModule):
         return ((a - b) ** 2).sum(dim=1).mean()
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        if self.augmented and len(self.points) and self.global_step % self.multiplier_every == 0:
+        if not (self.augmented and len(self.points)) or self.ramped < 1:
+            return
+        if self.global_step % self.multiplier_every == 0:
             with torch.no_grad():
                 off = self.map(self.points) - self.targets
                 self.multipliers += 2 * self.lambdas["landmarks"] * off
@@ -162,6 +173,11 @@ class PairMap(pl.LightningModule):
         folded = 100 * (determinant <= 0).double().mean()
         self.log("val/distortion", distortion, batch_size=len(batch.uv))
         self.log("val/folded_percent", folded, batch_size=len(batch.uv))
+
+    @property
+    def ramped(self) -> float:
+        """How far, from 0 to 1, landmarks and seam have come on the way to their full demand."""
+        return min(1.0, self.global_step / self.ramp_steps) if self.ramp_steps else 1.0
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)

@@ -1,0 +1,163 @@
+"""Collections of surfaces in correspondence: every pair's map, from one map of each."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from nsm.maps import Between, Rotated, build_planar
+from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import pair_metrics
+from nsm.results.surface_map import SurfaceMap
+
+FORMAT = "nsm-collection"
+VERSION = 1
+STEM = "collection"
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCollection:
+    """k surfaces, each with a map h_i of a common domain: F_{i→j}∘φ_i∘h_i = φ_j∘h_j.
+
+    Attributes:
+        surfaces: the neural surfaces φ_i.
+        maps: h_i, from the common domain to each surface's own, frozen.
+        landmarks: (L, k) vertices of the mesh files.
+        metrics: figures of :func:`collection_metrics`.
+        config: the settings of the run that made it.
+    """
+
+    surfaces: list[NeuralSurface]
+    maps: list[nn.Module]
+    landmarks: np.ndarray
+    metrics: dict[str, Any] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+    def pair(self, source: int, target: int) -> SurfaceMap:
+        """The map F_{source→target}: points, transfer and morph from any surface to any other."""
+        return self._pairs(source, target)
+
+    @property
+    def _pairs(self) -> Any:
+        if "_cached_pairs" not in self.__dict__:
+            self.__dict__["_cached_pairs"] = cache(self._pair)
+        return self.__dict__["_cached_pairs"]
+
+    def _pair(self, source: int, target: int) -> SurfaceMap:
+        # h_i is near the rotation that it started from, so the surface's vertices, turned back,
+        # lie densely in the common domain
+        first = self.maps[source]
+        turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
+        nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
+        h = Between(_double(first), _double(self.maps[target]), nodes)
+        ids = self.landmarks[:, [source, target]]
+        return SurfaceMap(
+            self.surfaces[source], self.surfaces[target], h.eval(), ids, {}, self.config
+        )
+
+    def save(self, folder: str | Path) -> None:
+        """Write the maps into a folder, and each surface into ``surface_0``, ... there.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        place = Path(folder)
+        tensors = {}
+        for k, (surface, h) in enumerate(zip(self.surfaces, self.maps, strict=True)):
+            save_surface(place / f"surface_{k}", surface)
+            tensors.update({f"{k}.{n}": v.contiguous() for n, v in h.state_dict().items()})
+        words = {
+            "map": self.maps[0].inner.config,  # type: ignore[union-attr]
+            "count": len(self),
+            "landmarks": self.landmarks.tolist(),
+            "metrics": self.metrics,
+            "config": self.config,
+        }
+        write_pair(place / STEM, FORMAT, VERSION, tensors, words)
+
+
+def load_collection(folder: str | Path) -> SurfaceCollection:
+    """Read what :meth:`SurfaceCollection.save` wrote.
+
+    Raises:
+        NsmError: files that are missing, truncated, damaged, or of another version.
+    """
+    place = Path(folder)
+    tensors, words = read_pair(place / STEM, FORMAT, VERSION)
+    try:
+        count = int(words["count"])
+        maps: list[nn.Module] = []
+        for k in range(count):
+            h = Rotated(build_planar(words["map"]), torch.eye(2))
+            own = {
+                n.split(".", 1)[1]: v for n, v in tensors.items() if n.split(".", 1)[0] == str(k)
+            }
+            h.load_state_dict(own)
+            maps.append(h.eval().requires_grad_(False))
+        landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, count)
+        metrics, config = dict(words["metrics"]), dict(words["config"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise misfit(place / STEM, error) from error
+    surfaces = [load_surface(place / f"surface_{k}") for k in range(count)]
+    return SurfaceCollection(surfaces, maps, landmarks, metrics, config)
+
+
+def collection_metrics(
+    collection: SurfaceCollection, points: np.ndarray, targets: Sequence[np.ndarray]
+) -> dict[str, Any]:
+    """Every ordered pair's figures, and the cycle error.
+
+    Args:
+        collection: the surfaces and their maps.
+        points: (K, 2) landmarks in the common domain.
+        targets: (K, 2) the same in each surface's own domain.
+
+    Returns:
+        ``pairs``: "i → j" to the figures of :func:`nsm.results.pair_metrics`; cycle_error_mean and
+        _max_percent: how far i→j→k→i misses a vertex, of the diagonal, over all cycles.
+    """
+    pairs = {}
+    for i, j in itertools.permutations(range(len(collection)), 2):
+        f = collection.pair(i, j)
+        s, t = f.source.surface, f.target.surface
+        landed = evaluate(f.map, targets[i]) if len(points) else points
+        pairs[f"{s.name} → {t.name}"] = pair_metrics(s, t, f.image_uv, landed, targets[j])
+    errors = [
+        _cycle_error(collection, *c) for c in itertools.permutations(range(len(collection)), 3)
+    ]
+    return {
+        "pairs": pairs,
+        "cycle_error_mean_percent": float(np.mean([e.mean() for e in errors])),
+        "cycle_error_max_percent": float(max(e.max() for e in errors)),
+    }
+
+
+def _cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
+    """Distance (V,) between a vertex of i and its image by i→j→k→i, in percent of the diagonal."""
+    surface = collection.surfaces[i]
+    start = surface.in_original_units(surface.surface.vertices[::7])
+    points = start
+    for a, b in ((i, j), (j, k), (k, i)):
+        points = collection.pair(a, b)(points)
+    diagonal = surface.surface.bounding_box_diagonal / surface.surface.scale
+    return 100 * np.linalg.norm(points - start, axis=1) / diagonal
+
+
+def _double(h: nn.Module) -> nn.Module:
+    """A copy in float64, for Newton's last digits."""
+    import copy
+
+    return copy.deepcopy(h).double()

@@ -1,0 +1,60 @@
+"""Pictures of collections: all ordered pairs as matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from nsm.results.collection import SurfaceCollection
+from nsm.results.pictures import checked, panels, save_figure
+from nsm.results.render import View
+
+_SHOWN = {
+    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
+    "flipped_percent": "flipped triangles, %",
+    "landmark_error_max_percent": "largest landmark error, % of diagonal",
+}
+_CELL = 300
+
+
+def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
+    """Main figures of every ordered pair, from row to column."""
+    names = [phi.surface.name for phi in collection.surfaces]
+    k = len(names)
+    figure = Figure(figsize=(5.2 * len(_SHOWN), 5.0), dpi=120)
+    for n, (key, title) in enumerate(_SHOWN.items()):
+        values = np.full((k, k), np.nan)
+        for i in range(k):
+            for j in range(k):
+                if i != j:
+                    values[i, j] = collection.metrics["pairs"][f"{names[i]} → {names[j]}"][key]
+        axes = figure.add_subplot(1, len(_SHOWN), n + 1)
+        axes.imshow(values, cmap="viridis_r")
+        middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
+        for i in range(k):
+            for j in range(k):
+                if i != j:
+                    colour = "white" if values[i, j] > middle else "black"
+                    axes.text(j, i, f"{values[i, j]:.3g}", ha="center", va="center", color=colour)
+        axes.set_xticks(range(k), names, rotation=30, ha="right")
+        axes.set_yticks(range(k), names)
+        axes.set_title(title)
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> None:
+    """Row i, column j: the checkerboard of surface i carried to surface j."""
+    rows = []
+    views = [View(phi.surface.vertices, _CELL) for phi in collection.surfaces]
+    for i, source in enumerate(collection.surfaces):
+        row = []
+        for j, target in enumerate(collection.surfaces):
+            t = target.surface
+            uv = source.surface.uv if i == j else collection.pair(i, j).source_uv
+            title = f"{source.surface.name} → {t.name}" if i != j else t.name
+            row.append((views[j].draw(t.vertices, t.faces, checked(uv)), title))
+        rows.append(row)
+    save_figure(panels(*rows), path)
