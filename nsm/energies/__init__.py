@@ -11,6 +11,7 @@ from nsm.energies.constraints import (
     outside_disc,
     outside_square,
     signed_distance,
+    unfold,
 )
 from nsm.energies.distortion import (
     arap,
@@ -64,4 +65,5 @@ __all__ = [
     "singular_values",
     "symmetric_arap",
     "symmetric_dirichlet",
+    "unfold",
 ]

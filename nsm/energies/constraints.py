@@ -115,6 +115,23 @@ def injectivity(det: Tensor) -> Tensor:
     return narrow(torch.where(depth > 0, exponential + tangent, 0.0), det.dtype)
 
 
+def unfold(det: Tensor, margin: float = 0.1) -> Tensor:
+    """((margin − det) / margin)² under the margin, zero above it; under zero along its tangent.
+
+    ``injectivity`` lets go of a triangle as soon as it is not flipped, and has no gradient until
+    it is; this one clears the way.
+
+    Args:
+        det: (...), determinants of J_h, or signed areas of triangles relative to their own.
+        margin: in (0, 1].
+
+    Returns:
+        (...), of the type of ``det``.
+    """
+    depth = (margin - widen(det)).clamp(min=0) / margin
+    return narrow(torch.where(depth > 1, 2 * depth - 1, depth**2), det.dtype)
+
+
 def landmark(points: Tensor, targets: Tensor) -> Tensor:
     """‖h(P_i) − Q_i‖², METHOD (C).
 

@@ -13,6 +13,7 @@ _STEPS = 25
 _SHRINK = 0.5
 
 
+@torch.no_grad()
 def inverted(h: nn.Module, targets: Tensor, start: Tensor) -> Tensor:
     """Points x (N, 2) with h(x) = targets (N, 2), by damped Newton steps from start (N, 2).
 

@@ -134,6 +134,13 @@ def build_collection_map(
     order = 2 if config.domain == "disc" else float("inf")
     rim = points[: matched.on_boundary]
     points[: matched.on_boundary] = rim / torch.linalg.vector_norm(rim, order, dim=1)[:, None]
+    meshes = [
+        (
+            torch.as_tensor(phi.surface.uv, dtype=torch.float32) @ turn,
+            torch.as_tensor(phi.surface.faces),
+        )
+        for phi, turn in zip(phis, turns, strict=True)
+    ]
     cut = all(len(phi.surface.twins) for phi in phis) and matched.on_boundary >= 2
     common = Matched([points.double().numpy()], matched.numbers, matched.on_boundary)
     seam = common.seam(config.domain, _SEAM_POINTS) if cut else np.zeros((0, 2, 2))
@@ -148,6 +155,7 @@ def build_collection_map(
             targets=targets,
             seam=torch.as_tensor(seam, dtype=torch.float32),
             turns=turns,
+            meshes=meshes,
             phis=[phi.map for phi in phis],
         ),
     )

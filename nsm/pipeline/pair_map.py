@@ -140,6 +140,7 @@ def build_pair_map(
             targets=q,
             seam=seam,
             turn=turn,
+            mesh=(uv, torch.as_tensor(surface.faces)),
             phi=phi.map,
             psi=psi.map,
         ),

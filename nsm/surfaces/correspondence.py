@@ -113,7 +113,7 @@ def corresponding_paths(
     landmarks: Sequence[np.ndarray],
     costs: Sequence[np.ndarray] | None = None,
     avoid: Sequence[np.ndarray] | None = None,
-) -> list[list[list[int]]]:
+) -> list[list[list[int]]] | None:
     """For each mesh, the L - 1 branches of one tree through all of its landmarks.
 
     Args:
@@ -125,9 +125,7 @@ def corresponding_paths(
 
     Returns:
         Per mesh, the branches as lists of vertices; branch b joins the same landmarks everywhere.
-
-    Raises:
-        NsmError: no tree was found (landmarks too close for the mesh's edges).
+        None if no tree was found (landmarks too close together for the mesh's edges).
     """
     tracers = []
     for m, (vertices, faces) in enumerate(meshes):
@@ -144,10 +142,7 @@ def corresponding_paths(
     branches: list[list[list[int]]] = [[] for _ in meshes]
     while len(branches[0]) < count - 1:
         if not queue:
-            raise NsmError(
-                "no seams through all landmarks were found: some are too close together for the "
-                "meshes' edges; leave one of them out, or subdivide the mesh"
-            )
+            return None
         _, i, j = heapq.heappop(queue)
         if component[i] == component[j]:
             continue

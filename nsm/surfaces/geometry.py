@@ -23,3 +23,26 @@ def point_mesh_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndar
         np.ascontiguousarray(points), np.ascontiguousarray(vertices), faces
     )[0]
     return np.sqrt(np.maximum(squared, 0))
+
+
+def triangle_distortion(
+    points: np.ndarray, image: np.ndarray, faces: np.ndarray, eps: float = 0.01
+) -> np.ndarray:
+    """Symmetric Dirichlet (F,) of each triangle's affine map from points (V, 3) to image (V, 3).
+
+    tr(M) + tr((M + eps I)⁻¹), METHOD Eq. 2, by the trace and determinant of A⁻¹B, which are M's;
+    infinite where a triangle of points has no area.
+    """
+
+    def forms(p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        a, b, c = (p[faces[:, k]] for k in range(3))
+        u, v = b - a, c - a
+        return (u * u).sum(axis=1), (u * v).sum(axis=1), (v * v).sum(axis=1)
+
+    (e, f, g), (h, m, n) = forms(points), forms(image)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / (e * g - f * f)
+        trace = (g * h - 2 * f * m + e * n) * inverse
+        determinant = (h * n - m * m) * inverse
+        value = trace + (trace + 2 * eps) / (determinant + eps * trace + eps**2)
+    return np.where(np.isfinite(value), value, np.inf)

@@ -20,7 +20,8 @@ from nsm.errors import NsmError
 from nsm.surfaces import topology
 
 DOMAINS = ("disc", "square")
-METHODS = ("tutte", "slim")
+# slim_held: SLIM without the sliding steps after it, a quick look at what slim would give
+METHODS = ("tutte", "slim_held", "slim")
 DOMAIN_AREA = {"disc": float(np.pi), "square": 4.0}
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -81,9 +82,10 @@ def parameterize(
             "floating point); give seam_vertices at the tips of long parts"
         )
     uv = start
-    if method == "slim":
+    if method != "tutte":
         held = _slim_held(vertices, faces, start, loop, boundary, log)
-        uv = slide(vertices, faces, held, loop, domain, _sliding_steps(len(faces)), keys)
+        steps = _sliding_steps(len(faces)) if method == "slim" else 0
+        uv = slide(vertices, faces, held, loop, domain, steps, keys)
         if flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop):
             uv = start
             log.append("SLIM result was not injective: Tutte's embedding kept")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.correspondence import (
+    SEAMS,
     boundary_keys,
     corresponding_paths,
     mutually_far,
@@ -19,6 +21,8 @@ from nsm.surfaces.correspondence import (
     turned_alike,
 )
 from nsm.surfaces.cutting import Cut, cut_along_paths
+from nsm.surfaces.geometry import triangle_distortion
+from nsm.surfaces.location import locate
 from nsm.surfaces.parameterization import (
     DOMAIN_AREA,
     Keys,
@@ -28,6 +32,10 @@ from nsm.surfaces.parameterization import (
 )
 from nsm.surfaces.surface import Surface
 from nsm.surfaces.validation import CleanMesh, clean
+
+# auto: shares of the landmarks that the seam is tried through
+_SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
+_WORST = 1e3  # a triangle's distortion counts no more than this
 
 
 @dataclass(frozen=True)
@@ -46,7 +54,7 @@ def prepare_together(
     *,
     domain: str = "disc",
     parameterization: str = "slim",
-    seam: str = "shortest",
+    seam: str = "auto",
     seam_landmarks: int | None = None,
     cache: bool = True,
 ) -> list[Surface]:
@@ -60,9 +68,10 @@ def prepare_together(
         meshes: two or more.
         landmarks: (L,) vertices of each, in the same order.
         domain, parameterization, cache: as for :meth:`Surface.load`.
-        seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides.
-        seam_landmarks: how many landmarks, mutually far ones, the seam passes through; all of
-            them by default.
+        seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
+            ``auto``, which tries both, and keeps what lets the domains agree best.
+        seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
+            all of them, or, with ``auto``, the number that lets the domains agree best.
 
     Raises:
         NsmError: a mesh that cannot be prepared, or no corresponding seams.
@@ -121,6 +130,16 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
     return kept
 
 
+@dataclass(frozen=True)
+class _CutAlike:
+    """One way to cut all meshes: the discs, and the keys (K,) on each one's boundary."""
+
+    seam: str
+    count: int
+    cuts: list[Cut]
+    keys: list[np.ndarray]
+
+
 def _cut_alike(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
@@ -130,11 +149,60 @@ def _cut_alike(
     seam: str,
     seam_landmarks: int | None,
 ) -> list[Surface]:
+    total = len(landmarks[0])
+    if seam == "auto":
+        counts = (
+            [seam_landmarks]
+            if seam_landmarks
+            else sorted({max(2, round(share * total)) for share in _SHARES})
+        )
+        tried = [
+            (_disagreement(way, landmarks), k, way)
+            for k, (path, count) in enumerate(itertools.product(SEAMS, counts))
+            if (way := _opened_alike(meshes, cleaned, landmarks, path, count)) is not None
+        ]
+        best = min(tried, default=(0.0, 0, None))[2]
+    else:
+        best = _opened_alike(meshes, cleaned, landmarks, seam, seam_landmarks or total)
+    if best is None:
+        raise NsmError(
+            "no seams through the landmarks were found: some are too close together for the "
+            "meshes' edges; leave one of them out, or subdivide the mesh"
+        )
+    fractions = common_fractions(best.cuts, best.keys, domain)
+    words = (
+        f"seam led along {best.seam} paths through {best.count} of {total} landmarks, alike on "
+        "all meshes"
+    )
+    return [
+        Surface.from_cut(
+            cut,
+            c.source_vertex,
+            name=m.name,
+            domain=domain,
+            parameterization=method,
+            keys=Keys(key, fractions),
+            log=(*m.log, *c.log, words),
+        )
+        for m, c, cut, key in zip(meshes, cleaned, best.cuts, best.keys, strict=True)
+    ]
+
+
+def _opened_alike(
+    meshes: Sequence[Mesh],
+    cleaned: Sequence[CleanMesh],
+    landmarks: Sequence[np.ndarray],
+    seam: str,
+    count: int,
+) -> _CutAlike | None:
+    """The meshes cut along one tree through ``count`` landmarks; None if there is no such tree."""
     pairs = [(c.vertices, c.faces) for c in cleaned]
     costs = [seam_costs(vertices, faces, seam) for vertices, faces in pairs]
-    chosen = mutually_far(pairs, landmarks, seam_landmarks)
+    chosen = mutually_far(pairs, landmarks, count)
     on_seam = [ids[chosen] for ids in landmarks]
     paths = corresponding_paths(pairs, on_seam, costs, avoid=landmarks)
+    if paths is None:
+        return None
     cuts = [
         cut_along_paths(c.vertices, c.faces, p, name=m.name)
         for c, p, m in zip(cleaned, paths, meshes, strict=True)
@@ -143,20 +211,56 @@ def _cut_alike(
         [boundary_keys(cut.origin, cut.loop, ids) for cut, ids in zip(cuts, on_seam, strict=True)]
     )
     assert keys is not None, "branches in the same cyclic order make equal walks"
-    fractions = common_fractions(cuts, [k[:, 1] for k in keys], domain)
-    words = f"seam led through {len(chosen)} of {len(landmarks[0])} landmarks, alike on all meshes"
-    return [
-        Surface.from_cut(
-            cut,
-            c.source_vertex,
-            name=m.name,
-            domain=domain,
-            parameterization=method,
-            keys=Keys(k[:, 1], fractions),
-            log=(*m.log, *c.log, words),
-        )
-        for m, c, cut, k in zip(meshes, cleaned, cuts, keys, strict=True)
+    return _CutAlike(seam, len(chosen), cuts, [k[:, 1] for k in keys])
+
+
+def _disagreement(way: _CutAlike, landmarks: Sequence[np.ndarray]) -> float:
+    """How badly the domains agree: the distortion of the maps that take each point of one domain
+    to the same point of another, and how far these miss the landmarks off the seam.
+
+    The worst ordered pair counts. Landmarks on the wrong side of a seam lie far apart in Ω, and
+    no map without folds brings them together; hence the factor.
+    """
+    fractions = np.mean(
+        [_arc_lengths(cut, key) for cut, key in zip(way.cuts, way.keys, strict=True)], axis=0
+    )
+    flat = [
+        parameterize(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
+        for cut, key in zip(_of_unit_area(way.cuts), way.keys, strict=True)
     ]
+    places = []
+    for cut, uv, ids in zip(way.cuts, flat, landmarks, strict=True):
+        off = [int(np.flatnonzero(cut.origin == v)[0]) for v in ids]
+        inner = [v for v in off if v not in set(cut.loop.tolist())]
+        places.append(uv[inner])
+    worst = 0.0
+    discs = _of_unit_area(way.cuts)
+    for i, j in itertools.permutations(range(len(discs)), 2):
+        image = locate(flat[i], flat[j], discs[j].faces).take(discs[j].vertices, discs[j].faces)
+        value = triangle_distortion(discs[i].vertices, image, discs[i].faces)
+        area = topology.face_areas(discs[i].vertices, discs[i].faces)
+        mean = float(np.average(np.minimum(value, _WORST), weights=area))
+        miss = np.linalg.norm(places[i] - places[j], axis=1).max(initial=0.0)
+        worst = max(worst, mean * (1 + float(miss)))
+    return worst
+
+
+def _of_unit_area(cuts: Sequence[Cut]) -> list[Cut]:
+    """The discs scaled to the area of Ω, as the distortion wants them."""
+    scales = [
+        np.sqrt(DOMAIN_AREA["disc"] / topology.face_areas(c.vertices, c.faces).sum()) for c in cuts
+    ]
+    return [replace(c, vertices=c.vertices * s) for c, s in zip(cuts, scales, strict=True)]
+
+
+def _arc_lengths(cut: Cut, keys: np.ndarray) -> np.ndarray:
+    """Fractions (K,) of the boundary's length at which its keys lie, the first at 0."""
+    loop = np.roll(cut.loop, -int(np.flatnonzero(cut.loop == keys[0])[0]))
+    points = cut.vertices[loop]
+    lengths = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)[:-1]]) / lengths.sum()
+    place = {int(v): k for k, v in enumerate(loop)}
+    return along[[place[int(v)] for v in keys]]
 
 
 def common_fractions(cuts: Sequence[Cut], keys: Sequence[np.ndarray], domain: str) -> np.ndarray:
@@ -166,10 +270,8 @@ def common_fractions(cuts: Sequence[Cut], keys: Sequence[np.ndarray], domain: st
     over the discs. On the square the keys nearest to the corners become the corners.
     """
     gaps = []
-    for cut, key in zip(cuts, keys, strict=True):
-        area = topology.face_areas(cut.vertices, cut.faces).sum()
-        unit = cut.vertices * np.sqrt(DOMAIN_AREA["disc"] / area)
-        uv = parameterize(unit, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
+    for cut, key in zip(_of_unit_area(cuts), keys, strict=True):
+        uv = parameterize(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
         angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
         gaps.append((np.roll(angle, -1) - angle) % 1.0)
     mean = np.mean(gaps, axis=0)

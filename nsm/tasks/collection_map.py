@@ -14,6 +14,7 @@ from nsm.maps import Rotated, build_planar
 from nsm.tasks.optimizers import configure
 from nsm.tasks.pair_map import BOUNDARIES, LANDMARKS
 from nsm.tasks.rim import rim
+from nsm.tasks.weakest import Weakest
 
 
 class CollectionMap(pl.LightningModule):
@@ -25,12 +26,13 @@ class CollectionMap(pl.LightningModule):
     Args:
         map: configuration of each h_i's network.
         optimizer, scheduler, max_steps, domain, weights: as for :class:`nsm.tasks.PairMap`.
-        lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam, boundary, landmarks,
-            multiplier_every, ramp: as there.
+        lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam, lambda_triangles,
+            boundary, landmarks, multiplier_every, ramp: as there.
         points: (K, 2) landmarks in the common domain.
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
         turns: (k, 2, 2) rotations of the inputs.
+        meshes: uv (V, 2), in the common domain, and faces (F, 3) of each surface.
         phis: the surfaces; none is trained.
 
     Raises:
@@ -51,6 +53,7 @@ class CollectionMap(pl.LightningModule):
         lambda_boundary: float,
         lambda_landmarks: float,
         lambda_seam: float,
+        lambda_triangles: float,
         boundary: str,
         landmarks: str,
         multiplier_every: int,
@@ -59,10 +62,11 @@ class CollectionMap(pl.LightningModule):
         targets: Tensor,
         seam: Tensor,
         turns: Tensor,
+        meshes: Sequence[tuple[Tensor, Tensor]],
         phis: Sequence[nn.Module],
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["phis", "points", "targets", "seam", "turns"])
+        self.save_hyperparameters(ignore=["phis", "points", "targets", "seam", "turns", "meshes"])
         if not 0 <= ramp <= 1:
             raise ValueError(f"constraints.ramp {ramp} is not in [0, 1]")
         for value, known in ((boundary, BOUNDARIES), (landmarks, LANDMARKS)):
@@ -75,6 +79,7 @@ class CollectionMap(pl.LightningModule):
             Rotated(build_planar({**map, "onto": onto}), turn) for turn in turns
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
+        self.weakest = nn.ModuleList(Weakest(*mesh) for mesh in meshes)
         self.domain = domain
         self.multiplier_every, self.ramp_steps = multiplier_every, ramp * max_steps
         self.lambdas = {
@@ -82,6 +87,7 @@ class CollectionMap(pl.LightningModule):
             "boundary": lambda_boundary,
             "landmarks": lambda_landmarks,
             "seam": lambda_seam,
+            "triangles": lambda_triangles,
         }
         self.register_buffer("points", points, persistent=False)
         self.register_buffer("targets", targets, persistent=False)
@@ -116,6 +122,9 @@ class CollectionMap(pl.LightningModule):
             loss = loss + (self.multipliers * (moved - wanted)).sum()
         if len(self.seam) and self.lambdas["seam"] > 0:
             terms["seam"] = self._seam_gap()
+        if self.lambdas["triangles"] > 0:
+            both = zip(self.map, self.weakest, strict=True)
+            terms["triangles"] = torch.stack([w(h, self.global_step) for h, w in both]).sum()
         for name, value in terms.items():
             share = self.ramped if name == "seam" else 1.0
             loss = loss + share * self.lambdas[name] * value

@@ -21,19 +21,21 @@ from nsm.energies import (
 from nsm.maps import Composition, Rotated, build_planar
 from nsm.tasks.optimizers import configure
 from nsm.tasks.rim import rim
+from nsm.tasks.weakest import Weakest
 
 BOUNDARIES = ("exact", "penalty")
 LANDMARKS = ("augmented", "fixed")
 
 
 class PairMap(pl.LightningModule):
-    """L = mean E(A, B) + λ_inv G + λ_C C + λ_seam ‖ψ(h(a)) − ψ(h(b))‖² (METHOD, B, G, C).
+    """L = mean E(A, B) + λ_inv G + λ_C C + λ_seam ‖ψ(h(a)) − ψ(h(b))‖² + λ_tri U
+    (METHOD, B, G, C).
 
     A = J_φᵀJ_φ and B = J(ψ∘h)ᵀJ(ψ∘h) at samples of the source. With ``boundary`` exact, h keeps
     to Ω by construction; with penalty, λ_B mean σ(h(∂Ω)) is added, and samples that h sends out
     of Ω leave the distortion and are pulled back. With ``landmarks`` augmented, multipliers are
     updated every ``multiplier_every`` steps (augmented Lagrangian), so that landmarks are met
-    whatever λ_C is.
+    whatever λ_C is. U keeps the mesh's triangles from folding (:class:`nsm.tasks.weakest.Weakest`).
 
     Args:
         map: configuration of h's network.
@@ -41,7 +43,8 @@ class PairMap(pl.LightningModule):
         max_steps: length of the schedule.
         domain: ``disc`` or ``square``.
         weights: energies by name with their weights (see :mod:`nsm.energies`).
-        lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam: the λs.
+        lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam,
+            lambda_triangles: the λs.
         boundary: ``exact`` or ``penalty``.
         landmarks: ``augmented`` or ``fixed``.
         multiplier_every: steps between two updates of the multipliers.
@@ -50,6 +53,7 @@ class PairMap(pl.LightningModule):
         points, targets: landmarks P (L, 2) and Q (L, 2) in the domains of source and target.
         seam: (T, 2, 2) pairs of points of ∂Ω that are one point of the source, and whose images
             should be one point of the target.
+        mesh: uv (V, 2) and faces (F, 3) of the source, whose triangles must not flip.
         turn: rotation (2, 2) of h's input (see :mod:`nsm.tasks.start`).
         phi, psi: source and target; neither is trained.
 
@@ -71,6 +75,7 @@ class PairMap(pl.LightningModule):
         lambda_boundary: float,
         lambda_landmarks: float,
         lambda_seam: float,
+        lambda_triangles: float,
         boundary: str,
         landmarks: str,
         multiplier_every: int,
@@ -79,11 +84,14 @@ class PairMap(pl.LightningModule):
         targets: Tensor,
         seam: Tensor,
         turn: Tensor,
+        mesh: tuple[Tensor, Tensor],
         phi: nn.Module,
         psi: nn.Module,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["phi", "psi", "points", "targets", "seam", "turn"])
+        self.save_hyperparameters(
+            ignore=["phi", "psi", "points", "targets", "seam", "turn", "mesh"]
+        )
         if not 0 <= ramp <= 1:
             raise ValueError(f"constraints.ramp {ramp} is not in [0, 1]")
         for value, known in ((boundary, BOUNDARIES), (landmarks, LANDMARKS)):
@@ -96,12 +104,14 @@ class PairMap(pl.LightningModule):
         self.phi = phi.eval().requires_grad_(False)
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
+        self.weakest = Weakest(*mesh)
         self.domain = domain
         self.lambdas = {
             "injectivity": lambda_injectivity,
             "boundary": lambda_boundary,
             "landmarks": lambda_landmarks,
             "seam": lambda_seam,
+            "triangles": lambda_triangles,
         }
         self.multiplier_every, self.ramp_steps = multiplier_every, ramp * max_steps
         self.register_buffer("points", points, persistent=False)
@@ -136,6 +146,8 @@ class PairMap(pl.LightningModule):
             loss = loss + (self.multipliers * (moved - wanted)).sum()
         if len(self.seam) and self.lambdas["seam"] > 0:
             terms["seam"] = self._seam_gap()
+        if self.lambdas["triangles"] > 0:
+            terms["triangles"] = self.weakest(self.map, self.global_step)
         for name, value in terms.items():
             share = self.ramped if name == "seam" else 1.0
             loss = loss + share * self.lambdas[name] * value

@@ -18,6 +18,7 @@ from nsm.energies import (
     outside_disc,
     outside_square,
     signed_distance,
+    unfold,
 )
 
 DISTANCES = {
@@ -152,3 +153,12 @@ def test_far_landmarks_stay_finite():
     value = landmark(p, torch.zeros(1, 2))
     value.sum().backward()
     assert value.isfinite().all() and p.grad.isfinite().all()
+
+
+def test_unfold_has_its_closed_form_and_slopes_below_zero():
+    det = torch.tensor([-1.0, 0.0, 0.05, 0.1, 1.0], dtype=torch.float64, requires_grad=True)
+    value = unfold(det, margin=0.1)
+    assert torch.allclose(value, torch.tensor([21.0, 1.0, 0.25, 0.0, 0.0], dtype=torch.float64))
+    (slope,) = torch.autograd.grad(value.sum(), det)
+    assert torch.allclose(slope, torch.tensor([-20.0, -20, -10, 0, 0], dtype=torch.float64))
+    assert unfold(torch.tensor([-3e38])).isfinite().all()

@@ -4,7 +4,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nsm.energies import symmetric_dirichlet
+from nsm.results.map_metrics import triangle_metric
 from nsm.surfaces import shapes
+from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.location import locate
 
 
@@ -32,3 +35,13 @@ def test_values_of_any_shape_are_interpolated():
     places = locate(vertices[:10], vertices, faces)
     values = np.arange(len(vertices) * 6, dtype=float).reshape(-1, 2, 3)
     assert np.abs(places.take(values, faces) - values[:10]).max() < 1e-6
+
+
+def test_triangle_distortion_is_that_of_the_energies():
+    vertices, faces = shapes.sphere(2)
+    image = vertices * [1.3, 0.7, 2.0]
+    expected = symmetric_dirichlet(triangle_metric(vertices, faces), triangle_metric(image, faces))
+    value = triangle_distortion(vertices, image, faces)
+    assert np.abs(value / expected.numpy() - 1).max() < 1e-9
+    assert np.abs(triangle_distortion(vertices, vertices, faces) - (2 + 2 / 1.01)).max() < 1e-9
+    assert np.isinf(triangle_distortion(0 * vertices, image, faces)).all()

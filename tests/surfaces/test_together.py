@@ -79,7 +79,7 @@ def test_walks_in_other_orders_are_not_alike():
 @pytest.mark.parametrize("domain", ["disc", "square"])
 def test_landmarks_on_the_seam_have_the_same_place_in_all_domains(pair, domain):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, domain=domain, cache=False)
+    surfaces = prepare_together(meshes, ids, domain=domain, seam="shortest", cache=False)
     p, q = matched_landmarks(surfaces, ids).points
     assert len(p) == 2 * (len(POINTS) - 1)
     assert np.abs(p - q).max() < 1e-12
@@ -93,19 +93,27 @@ def test_landmarks_on_the_seam_have_the_same_place_in_all_domains(pair, domain):
 
 def test_the_seam_keeps_off_landmarks_that_it_does_not_pass_through(pair):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, seam_landmarks=3, cache=False)
+    surfaces = prepare_together(meshes, ids, seam="hidden", seam_landmarks=3, cache=False)
     p, _ = matched_landmarks(surfaces, ids).points
     inner = np.linalg.norm(p, axis=1) < 1 - 1e-9
     assert inner.sum() == len(POINTS) - 3
 
 
+def test_the_best_of_several_seams_is_taken(pair):
+    meshes, ids = pair
+    surfaces = prepare_together(meshes, ids, cache=False)
+    told = next(line for line in surfaces[0].log if line.startswith("seam led along"))
+    assert "of 6 landmarks, alike on all meshes" in told
+    matched_landmarks(surfaces, ids)
+
+
 def test_prepared_surfaces_are_taken_from_the_cache(pair):
     meshes, ids = pair
-    first = prepare_together(meshes, ids)
-    second = prepare_together(meshes, ids)
+    first = prepare_together(meshes, ids, seam="shortest")
+    second = prepare_together(meshes, ids, seam="shortest")
     assert "prepared surface taken from the cache" in second[1].log
     assert (first[1].uv == second[1].uv).all()
-    other = prepare_together(meshes, [i[::-1] for i in ids], cache=True)
+    other = prepare_together(meshes, [i[::-1] for i in ids], seam="shortest")
     assert "prepared surface taken from the cache" not in other[1].log
 
 
@@ -170,7 +178,7 @@ def test_the_animals_are_cut_alike(shared_meshes):
 
 def test_the_common_seam_glues_each_branch_to_its_way_back(pair):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, cache=False)
+    surfaces = prepare_together(meshes, ids, seam="shortest", cache=False)
     matched = matched_landmarks(surfaces, ids)
     seam = matched.seam("disc", 4)
     assert seam.shape == (4 * (len(POINTS) - 1), 2, 2)

@@ -1,0 +1,171 @@
+"""Maps between the shared meshes: quality and time, one JSON file for each case.
+
+Cases that are there already are left alone, so that an interrupted run goes on where it stopped:
+
+    python benchmarks/maps.py --meshes FOLDER [--only CASE ...]
+
+Seconds are wall time of a map from ready surfaces, with one torch thread on the CPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import nsm
+
+RESULTS = Path(__file__).parent / "results" / "maps"
+ANIMALS = ("shrec07-381", "shrec07-384", "shrec07-388", "shrec07-393")
+# what changes from the default, one thing at a time, on one pair
+VARIANTS = {
+    "default": [],
+    "landmarks by a fixed weight": ["constraints.landmarks=fixed"],
+    "landmarks and seam in full at once": ["constraints.ramp=0"],
+    "no term on triangles": ["constraints.lambda_triangles=0"],
+    "no term on the seam": ["constraints.lambda_seam=0"],
+    "boundary by a penalty": ["constraints.boundary=penalty"],
+    "paper, as many steps": ["experiment=paper_pair", "trainer.max_steps=1500"],
+}
+SEAMS = {
+    "auto": [],
+    "shortest, all landmarks": ["seam.path=shortest"],
+    "hidden, all landmarks": ["seam.path=hidden"],
+    "shortest, a third": ["seam.path=shortest", "seam.landmarks=7"],
+    "hidden, a third": ["seam.path=hidden", "seam.landmarks=7"],
+}
+
+
+def timed(make: Callable[[], Any]) -> tuple[Any, float]:
+    start = time.perf_counter()
+    result = make()
+    return result, round(time.perf_counter() - start, 1)
+
+
+def pair(source: Any, target: Any, landmarks: Any, overrides: list[str]) -> dict[str, Any]:
+    """Figures of a map; raw meshes are made into neural surfaces before the clock starts."""
+
+    def run(words: list[str]) -> Any:
+        return nsm.map_pair(source, target, landmarks, overrides=words, progress=False)
+
+    if isinstance(source, str):
+        f = run([*overrides, "trainer.max_steps=1"])  # fills the cache
+        source, target = f.source, f.target
+        landmarks = f.landmarks.tolist() or None
+    f, seconds = timed(lambda: run(overrides))
+    words = {
+        phi.surface.name: {
+            "rms_percent": phi.metrics.get("rms_percent"),
+            "median_symmetric_dirichlet": phi.surface.quality.get("median_symmetric_dirichlet"),
+            "log": list(phi.surface.log),
+        }
+        for phi in (f.source, f.target)
+    }
+    return {"map_seconds": seconds, "metrics": f.metrics, "surfaces": words}
+
+
+def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
+    marks = meshes / "landmarks"
+
+    def animal(name: str) -> str:
+        return str(meshes / f"{name}.off")
+
+    def points(*names: str) -> list[str]:
+        return [str(marks / f"{name}.vts") for name in names]
+
+    cat, horse = (str(meshes / f"cat_horse-{k}.obj") for k in (0, 1))
+    both = [str(marks / f"cat_horse-{k}.txt") for k in (0, 1)]
+
+    def collection() -> dict[str, Any]:
+        files = [animal(name) for name in ANIMALS]
+        nsm.map_collection(files, points(*ANIMALS), overrides=["trainer.max_steps=1"])
+        group, seconds = timed(lambda: nsm.map_collection(files, points(*ANIMALS), progress=False))
+        return {"map_seconds": seconds, "metrics": group.metrics}
+
+    def ordered(i: int, j: int) -> dict[str, Any]:
+        # prepared together, as in the collection: the surfaces come from the cache
+        files = [animal(name) for name in ANIMALS]
+        group = nsm.map_collection(
+            files, points(*ANIMALS), overrides=["trainer.max_steps=1"], progress=False
+        )
+        a, b = group.surfaces[i], group.surfaces[j]
+        return pair(a, b, group.landmarks[:, [i, j]].tolist(), [])
+
+    result: dict[str, Callable[[], dict[str, Any]]] = {
+        "cat-horse": lambda: pair(cat, horse, both, []),
+        "horse-cat": lambda: pair(horse, cat, both[::-1], []),
+        "collection": collection,
+    }
+    for i, j in itertools.permutations(range(len(ANIMALS)), 2):
+        result[f"{ANIMALS[i][-3:]}-{ANIMALS[j][-3:]}"] = lambda i=i, j=j: ordered(i, j)  # type: ignore[misc]
+    result["igea-sphere_cap"] = lambda: pair(str(meshes / "igea.ply"), "sphere_cap", None, [])
+    study = (animal("shrec07-384"), animal("shrec07-388"), points("shrec07-384", "shrec07-388"))
+    for group, variants in (("setting", VARIANTS), ("seam", SEAMS)):
+        for name, words in variants.items():
+            if words or group == "setting":
+                key = f"{group}: {name}"
+                result[key] = lambda words=words: pair(*study, words)  # type: ignore[misc]
+    return result
+
+
+COLUMNS = {
+    "symmetric_dirichlet_median": "median",
+    "symmetric_dirichlet_mean": "mean",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_percent": "flipped %",
+    "outside_percent": "outside %",
+    "landmark_error_max_percent": "landmark error, largest %",
+    "covered_percent": "covered %",
+    "seam_gap_mean_percent": "seam gap, mean %",
+}
+
+
+def table() -> str:
+    """All results as a table; the distortion is symmetric Dirichlet, 4 at best."""
+    lines = [
+        "| map | " + " | ".join(COLUMNS.values()) + " | seconds |",
+        "|---" * (len(COLUMNS) + 2) + "|",
+    ]
+    for file in sorted(RESULTS.glob("*.json")):
+        words = json.loads(file.read_text())
+        rows = words["metrics"].get("pairs", {words["case"]: words["metrics"]})
+        for name, metrics in rows.items():
+            label = name if rows is not words["metrics"].get("pairs") else f"collection: {name}"
+            values = " | ".join(f"{metrics[key]:.3f}" for key in COLUMNS)
+            lines.append(f"| {label} | {values} | {words['map_seconds']:.0f} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--meshes", type=Path, default=Path("../shared/meshes"))
+    parser.add_argument("--only", nargs="*", help="cases to run; all by default")
+    arguments = parser.parse_args()
+    if not arguments.meshes.is_dir():
+        parser.error(f"{arguments.meshes}: no such folder; give one with --meshes")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    for name, run in cases(arguments.meshes).items():
+        file = RESULTS / f"{name.replace(': ', '-').replace(', ', '-').replace(' ', '_')}.json"
+        if file.exists() or (arguments.only and name not in arguments.only):
+            continue
+        print(name, flush=True)
+        words = {
+            "case": name,
+            "torch": torch.__version__,
+            "machine": platform.machine(),
+            **run(),
+        }
+        file.write_text(json.dumps(words, indent=2) + "\n")
+    (RESULTS.parent / "maps.md").write_text(table())
+    print(table())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""The triangles of a mesh that a planar map is nearest to folding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from nsm.energies import unfold
+
+_COUNT = 256
+_EVERY = 25  # steps between two looks at all triangles
+
+
+class Weakest(nn.Module):
+    """Finds the triangles whose images have the least signed area relative to their own.
+
+    Samples of Ω hardly ever meet the few triangles that fold; flips are counted on the mesh, so
+    they are looked for there.
+
+    Args:
+        uv: (V, 2) vertices of the mesh in Ω.
+        faces: (F, 3), counter-clockwise.
+    """
+
+    uv: Tensor
+    faces: Tensor
+    area: Tensor
+    chosen: Tensor
+
+    def __init__(self, uv: Tensor, faces: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("uv", uv, persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        self.register_buffer("area", _double_areas(uv[faces]).clamp(min=1e-12), persistent=False)
+        # in the state, so that resumed training goes on with the same ones
+        self.register_buffer("chosen", torch.arange(min(_COUNT, len(faces))))
+
+    def forward(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
+        """Mean ``unfold`` over the weakest triangles under h: a scalar."""
+        if step % _EVERY == 0:
+            with torch.no_grad():
+                relative = _double_areas(h(self.uv)[self.faces]) / self.area
+                self.chosen = relative.topk(len(self.chosen), largest=False).indices
+        corners = self.uv[self.faces[self.chosen]]
+        image = h(corners.reshape(-1, 2)).reshape(-1, 3, 2)
+        relative = _double_areas(image) / self.area[self.chosen]
+        return unfold(relative).mean()
+
+
+def _double_areas(corners: Tensor) -> Tensor:
+    """Twice the signed areas (F,) of triangles (F, 3, 2)."""
+    a, b, c = corners.unbind(dim=1)
+    u, v = b - a, c - a
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

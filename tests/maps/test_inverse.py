@@ -1,0 +1,43 @@
+"""Inverse maps by Newton's method."""
+
+import torch
+
+from nsm.maps import Between, build_planar, inverted
+
+
+def stirred(seed, scale=0.15):
+    torch.manual_seed(seed)
+    h = build_planar(
+        {"width": 8, "depth": 1, "activation": {"name": "tanh"}, "onto": "disc"}
+    ).double()
+    for p in h.network.output.parameters():
+        torch.nn.init.normal_(p, std=scale)
+    return h
+
+
+def disc(n, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    r = torch.rand(n, generator=g, dtype=torch.float64).sqrt()
+    t = 2 * torch.pi * torch.rand(n, generator=g, dtype=torch.float64)
+    return torch.stack([r * t.cos(), r * t.sin()], dim=1)
+
+
+def test_the_inverse_undoes_the_map():
+    h, x = stirred(0), disc(300)
+    assert (torch.linalg.det(h.value_and_jacobian(x)[1]) > 0).all()
+    assert (inverted(h, h(x), h(x)) - x).norm(dim=1).max() < 1e-9
+
+
+def test_a_point_without_preimage_is_never_farther_than_the_start():
+    h, start = stirred(1), disc(20)
+    targets = torch.full((20, 2), 5.0, dtype=torch.float64)
+    before = (h(start) - targets).norm(dim=1)
+    assert ((h(inverted(h, targets, start)) - targets).norm(dim=1) <= before + 1e-12).all()
+
+
+def test_between_two_maps_goes_through_the_common_domain():
+    first, second, x = stirred(2), stirred(3), disc(200)
+    between = Between(first, second, disc(400, seed=1))
+    assert (between(first(x)) - second(x)).norm(dim=1).max() < 1e-8
+    back = Between(second, first, disc(400, seed=1))
+    assert (back(between(first(x))) - first(x)).norm(dim=1).max() < 1e-8

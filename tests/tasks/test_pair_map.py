@@ -1,0 +1,281 @@
+"""PairMap and CollectionMap: known maps are found, constraints hold, runs resume."""
+
+import numpy as np
+import pytest
+import torch
+
+from nsm.maps import build_analytic
+from nsm.surfaces.shapes import ring_mesh
+from nsm.tasks import CollectionMap, PairMap
+from nsm.tasks.start import landmark_rotation, least_distorting_rotation
+from nsm.tasks.weakest import Weakest
+
+SETTINGS = {
+    "map": {
+        "width": 16,
+        "depth": 1,
+        "activation": {"name": "softplus", "beta": 10.0},
+        "encoding": {"name": "identity"},
+    },
+    "optimizer": {"name": "adam", "lr": 3e-3},
+    "scheduler": {"name": "constant"},
+    "max_steps": 200,
+    "domain": "disc",
+    "weights": {"symmetric_dirichlet": 1.0},
+    "lambda_injectivity": 100.0,
+    "lambda_boundary": 1e3,
+    "lambda_landmarks": 10.0,
+    "lambda_seam": 0.0,
+    "lambda_triangles": 0.0,
+    "boundary": "exact",
+    "landmarks": "augmented",
+    "multiplier_every": 10,
+    "ramp": 0.0,
+}
+NONE = torch.zeros(0, 2)
+_POINTS, _FACES = ring_mesh(8)
+MESH = (torch.as_tensor(_POINTS, dtype=torch.float32), torch.as_tensor(_FACES))
+
+
+def samples(n=256, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    r, t = torch.rand(n, generator=g).sqrt(), 2 * torch.pi * torch.rand(n, generator=g)
+    return torch.stack([r * t.cos(), r * t.sin()], dim=1)
+
+
+def pair(phi, psi, points=NONE, targets=NONE, turn=None, **changes):
+    torch.manual_seed(0)
+    return PairMap(
+        **{**SETTINGS, **changes},
+        points=points,
+        targets=targets,
+        seam=torch.zeros(0, 2, 2),
+        turn=torch.eye(2) if turn is None else turn,
+        mesh=MESH,
+        phi=phi,
+        psi=psi,
+    )
+
+
+def surface(name, **parameters):
+    return build_analytic({"name": name, **parameters})
+
+
+def optimise(module, steps, every=10):
+    """Plain optimisation without a trainer: the module's own steps."""
+    module.log = lambda *a, **k: None
+    optimiser = torch.optim.Adam(module.map.parameters(), lr=3e-3)
+    for step in range(steps):
+        optimiser.zero_grad()
+        batch = samples(seed=step)
+        x = batch if isinstance(module, CollectionMap) else Batch(batch)
+        module.training_step(x, step).backward()
+        optimiser.step()
+        if step % every == every - 1:  # without a trainer the module cannot count its steps
+            module.on_train_batch_end(None, x, step)
+    return module
+
+
+class Batch:
+    def __init__(self, uv):
+        self.uv = uv
+
+
+def test_the_identity_between_equal_surfaces_is_the_minimum():
+    module = pair(surface("saddle"), surface("saddle"))
+    energy, determinant, image = module._distortion(samples())
+    assert energy.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
+    assert (determinant == 1).all() and (image == samples()).all()
+
+
+def test_an_isometry_between_different_surfaces_is_the_minimum():
+    # a cylinder patch unrolls onto the plane without stretch
+    module = pair(surface("cylinder"), surface("plane"))
+    energy, _, _ = module._distortion(samples())
+    assert energy.item() == pytest.approx(2 + 2 / 1.01, rel=1e-4)
+
+
+def test_a_rotation_of_the_source_is_undone_by_the_start():
+    angle = 0.7
+    c, s = np.cos(angle), np.sin(angle)
+    turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float32)
+    p = samples(5)
+    assert (landmark_rotation("disc", p, p @ turn.T) - turn).abs().max() < 1e-6
+    quarter = landmark_rotation("square", p, p @ torch.tensor([[0.1, 1.0], [-1.0, 0.1]]))
+    assert (quarter.abs().round() - quarter.abs()).abs().max() < 1e-6
+
+
+def test_without_landmarks_the_least_distorting_rotation_is_taken():
+    # a saddle turned by a quarter turns to its mirror image: only multiples of a half fit
+    bent = surface("graph", z="0.8*u*u")
+    across = surface("graph", z="0.8*v*v")
+    turn = least_distorting_rotation("disc", bent, across, samples(512))
+    assert abs(abs(turn[0, 1].item()) - 1) < 1e-6
+    assert (least_distorting_rotation("square", bent, bent, samples(512))[0, 0].abs() - 1) < 1e-6
+
+
+def test_optimisation_lowers_distortion_and_meets_landmarks():
+    points = torch.tensor([[0.3, 0.1], [-0.4, 0.2]])
+    targets = torch.tensor([[0.25, 0.2], [-0.45, 0.1]])
+    module = optimise(pair(surface("plane"), surface("sphere_cap"), points, targets), 250)
+    assert (module(points) - targets).norm(dim=1).max() < 5e-3
+    energy, determinant, _ = module._distortion(samples(2000))
+    assert energy.item() < 4.5 and (determinant > 0).all()
+
+
+def test_multipliers_meet_landmarks_better_than_a_fixed_weight():
+    points, targets = torch.tensor([[0.3, 0.1]]), torch.tensor([[0.0, 0.1]])
+    off = {}
+    for kind in ("augmented", "fixed"):
+        module = pair(surface("plane"), surface("plane"), points, targets, landmarks=kind)
+        module.lambdas["landmarks"] = 10.0
+        off[kind] = (optimise(module, 800, every=25)(points) - targets).norm().item()
+    assert off["augmented"] < 0.3 * off["fixed"]
+
+
+def test_the_penalty_boundary_pulls_the_image_back():
+    points, targets = torch.tensor([[0.9, 0.0]]), torch.tensor([[1.2, 0.0]])
+    loose = pair(
+        surface("plane"),
+        surface("plane"),
+        points,
+        targets,
+        boundary="penalty",
+        landmarks="fixed",
+        lambda_boundary=0.0,
+    )
+    held = pair(
+        surface("plane"),
+        surface("plane"),
+        points,
+        targets,
+        boundary="penalty",
+        landmarks="fixed",
+        lambda_boundary=1e3,
+    )
+    reach = [optimise(m, 150)(m.rim).norm(dim=1).sub(1).abs().max().item() for m in (loose, held)]
+    assert reach[1] < 0.3 * reach[0]
+
+
+def test_samples_outside_leave_the_distortion_but_are_pulled():
+    module = pair(surface("plane"), surface("plane"), boundary="penalty")
+    module.log = lambda *a, **k: None
+    outside = Batch(1.5 * samples())
+    loss = module.training_step(outside, 0)
+    assert torch.isfinite(loss) and loss > 4
+
+
+def test_the_ramp_moves_targets_from_the_start_to_their_place():
+    module = pair(surface("plane"), surface("plane"), ramp=0.5)
+    assert module.ramped == 0.0
+    assert pair(surface("plane"), surface("plane")).ramped == 1.0
+
+
+def test_the_seam_term_draws_both_copies_together():
+    seam = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
+    torch.manual_seed(0)
+    module = PairMap(
+        **{**SETTINGS, "lambda_seam": 10.0},
+        points=NONE,
+        targets=NONE,
+        seam=seam,
+        turn=torch.eye(2),
+        mesh=MESH,
+        phi=surface("plane"),
+        psi=surface("plane"),
+    )
+    before = module._seam_gap().item()
+    assert before == pytest.approx(2.0, rel=1e-5)
+    assert optimise(module, 60)._seam_gap().item() < before
+
+
+@pytest.mark.parametrize(
+    "changes", [{"boundary": "soft"}, {"landmarks": "soft"}, {"ramp": 2.0}, {"weights": {"no": 1}}]
+)
+def test_settings_that_are_not_known_are_refused(changes):
+    with pytest.raises(ValueError):
+        pair(surface("plane"), surface("plane"), **changes)
+
+
+def collection(names, points=NONE, targets=None, **changes):
+    torch.manual_seed(0)
+    k = len(names)
+    return CollectionMap(
+        **{**SETTINGS, **changes},
+        points=points,
+        targets=torch.zeros(k, 0, 2) if targets is None else targets,
+        seam=torch.zeros(0, 2, 2),
+        turns=torch.eye(2).expand(k, 2, 2),
+        meshes=[MESH] * k,
+        phis=[surface(n) for n in names],
+    )
+
+
+def test_a_collection_of_equal_surfaces_starts_at_the_minimum():
+    energy, determinant = collection(["saddle"] * 3)._distortion(samples())
+    assert energy.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
+    assert determinant.shape == (3, 256)
+
+
+def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
+    module = collection(["plane", "sphere_cap"])
+    x = samples(4096)
+    energy, _ = module._distortion(x)
+    forth, _, _ = pair(surface("plane"), surface("sphere_cap"))._distortion(x)
+    cap = surface("sphere_cap")
+    area = torch.linalg.det((j := cap.value_and_jacobian(x)[1]).transpose(1, 2) @ j).sqrt()
+    # samples are uniform on the plane: back counts by the cap's area
+    other = pair(cap, surface("plane"))
+    with torch.no_grad():
+        from nsm.energies import first_fundamental_form, symmetric_dirichlet
+
+        a = first_fundamental_form(cap.value_and_jacobian(x)[1])
+        b = first_fundamental_form(surface("plane").value_and_jacobian(x)[1])
+        back = (area * symmetric_dirichlet(a, b)).sum() / area.sum()
+        plane = torch.ones_like(area)
+        weight = plane / ((plane + area) / 2)
+        forth_weighted = (weight * symmetric_dirichlet(b, a)).sum() / weight.sum()
+        cap_weight = area / ((plane + area) / 2)
+        back_weighted = (cap_weight * symmetric_dirichlet(a, b)).sum() / cap_weight.sum()
+    assert energy.item() == pytest.approx(0.5 * (forth_weighted + back_weighted).item(), rel=1e-4)
+    assert forth.item() == pytest.approx(forth_weighted.item(), rel=0.05)
+    assert back.item() == pytest.approx(back_weighted.item(), rel=0.05)
+    assert other is not None
+
+
+def test_a_collection_meets_its_landmarks_on_every_surface():
+    points = torch.tensor([[0.2, 0.1]])
+    targets = torch.tensor([[[0.3, 0.1]], [[0.1, 0.1]], [[0.2, 0.2]]])
+    module = optimise(collection(["plane", "saddle", "sphere_cap"], points, targets), 500)
+    assert (module(points) - targets).norm(dim=2).max() < 0.01
+
+
+def test_the_weakest_triangles_are_those_that_fold():
+    weakest = Weakest(*MESH)
+
+    def folding(x):  # the right end is folded back
+        return torch.where(x[:, :1] > 0.8, torch.stack([1.6 - x[:, 0], x[:, 1]], dim=1), x)
+
+    assert weakest(folding, 0) > 0.05
+    corners = MESH[0][MESH[1][weakest.chosen]]
+    assert corners[:5, :, 0].max(dim=1).values.min() > 0.8
+    assert weakest(lambda x: x, 25) == 0
+
+
+def test_folded_triangles_are_unfolded():
+    torch.manual_seed(0)
+    values = torch.tensor([[0.05, 0.0]]).repeat(len(MESH[0]), 1) + MESH[0]
+    centre = MESH[0].norm(dim=1) == 0
+    moved = torch.where(centre[:, None], values + 0.14, values).requires_grad_()
+    weakest, optimiser = Weakest(*MESH), torch.optim.Adam([moved], lr=0.01)
+    start = weakest(lambda x: moved if len(x) == len(moved) else moved[nearest(x)], 0)
+    assert start > 0
+    for step in range(400):
+        optimiser.zero_grad()
+        weakest(lambda x: moved if len(x) == len(moved) else moved[nearest(x)], step).backward()
+        optimiser.step()
+    assert weakest(lambda x: moved if len(x) == len(moved) else moved[nearest(x)], 0) < 1e-3
+
+
+def nearest(x):
+    return torch.cdist(x, MESH[0]).argmin(dim=1)
