@@ -9,21 +9,23 @@ from torch import Tensor, nn
 
 from nsm.maps.composition import PointMap
 
-_STEPS = 25
-_SHRINK = 0.5
+_STEPS, _HALVINGS, _SHRINK = 30, 12, 0.5
+_EXACT = 1e-13
+_STARTS, _ENOUGH = 12, 1e-9
 
 
 @torch.no_grad()
-def inverted(h: nn.Module, targets: Tensor, start: Tensor) -> Tensor:
+def inverted(h: nn.Module, targets: Tensor, start: Tensor, onto: str | None = None) -> Tensor:
     """Points x (N, 2) with h(x) = targets (N, 2), by damped Newton steps from start (N, 2).
 
     A step that would not come nearer is halved; where none helps, the point stays as it is, so
-    that the result is never farther off than the start. Inside is kept to by the caller's choice
-    of h: outside Ω a map is whatever its network makes of it.
+    that the result is never farther off than the start.
 
     Args:
         h: a planar map with ``value_and_jacobian``, injective near the points.
         targets, start: (N, 2); float64 for the last digits, where h is of that type.
+        onto: ``disc`` or ``square``, which no x may leave: outside, h is whatever its network
+            makes of it.
     """
     x = start.clone()
     for _ in range(_STEPS):
@@ -33,14 +35,25 @@ def inverted(h: nn.Module, targets: Tensor, start: Tensor) -> Tensor:
         safe = torch.linalg.det(jacobian).abs() > 1e-12
         identity = torch.eye(2, dtype=x.dtype, device=x.device)
         step = torch.linalg.solve(torch.where(safe[:, None, None], jacobian, identity), off)
+        best = x
         scale = torch.ones_like(distance)
-        for _ in range(6):
-            nearer = (targets - h(x + scale[:, None] * step)).norm(dim=1) < distance
-            scale = torch.where(nearer, scale, scale * _SHRINK)
-        x = torch.where(nearer[:, None], x + scale[:, None] * step, x)
-        if float(distance.max()) < 1e-12 or not nearer.any():
+        nearer = torch.zeros_like(safe)
+        for _ in range(_HALVINGS):
+            trial = _kept(x + scale[:, None] * step, onto)
+            now = ~nearer & ((targets - h(trial)).norm(dim=1) < distance)
+            best = torch.where(now[:, None], trial, best)
+            nearer |= now
+            scale = _SHRINK * scale
+        x = best
+        if distance.max() < _EXACT or not nearer.any():
             break
     return x
+
+
+def _kept(x: Tensor, onto: str | None) -> Tensor:
+    if onto == "disc":
+        return x / torch.linalg.vector_norm(x, dim=1, keepdim=True).clamp(min=1)
+    return x.clamp(-1, 1) if onto == "square" else x
 
 
 class Between(nn.Module):
@@ -48,23 +61,42 @@ class Between(nn.Module):
 
     Args:
         first, second: h_i and h_j, from the common domain.
-        nodes: (M, 2) points of the common domain; Newton's method starts from the one whose image
-            under h_i is nearest.
+        nodes: (M, 2) points of the common domain; Newton's method starts from the few whose
+            images under h_i are nearest, until one leads to the point.
+        onto: the domain that h_i keeps to, if any.
     """
 
-    def __init__(self, first: nn.Module, second: nn.Module, nodes: Tensor) -> None:
-        super().__init__()
-        self.first, self.second = first, second
-        self.register_buffer("nodes", nodes, persistent=False)
-
     nodes: Tensor
+
+    def __init__(
+        self, first: nn.Module, second: nn.Module, nodes: Tensor, onto: str | None = None
+    ) -> None:
+        super().__init__()
+        self.first, self.second, self.onto = first, second, onto
+        self.register_buffer("nodes", nodes, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
         return self.second(self.back(x))
 
+    @torch.no_grad()
     def back(self, x: Tensor) -> Tensor:
         """h_i⁻¹: (N, 2) to points (N, 2) of the common domain."""
         images = self.first(self.nodes)
-        nearest = torch.cat([torch.cdist(part, images).argmin(dim=1) for part in x.split(2048)])
-        return inverted(self.first, x, self.nodes[nearest])
+        near = torch.cat(
+            [
+                torch.cdist(part, images).topk(min(_STARTS, len(images)), largest=False).indices
+                for part in x.split(2048)
+            ]
+        )
+        result = inverted(self.first, x, self.nodes[near[:, 0]], self.onto)
+        off = (self.first(result) - x).norm(dim=1)
+        for k in range(1, near.shape[1]):
+            missed = (off > _ENOUGH).nonzero()[:, 0]
+            if len(missed) == 0:
+                break
+            other = inverted(self.first, x[missed], self.nodes[near[missed, k]], self.onto)
+            distance = (self.first(other) - x[missed]).norm(dim=1)
+            better = distance < off[missed]
+            result[missed[better]], off[missed[better]] = other[better], distance[better]
+        return result

@@ -134,13 +134,14 @@ def build_collection_map(
     order = 2 if config.domain == "disc" else float("inf")
     rim = points[: matched.on_boundary]
     points[: matched.on_boundary] = rim / torch.linalg.vector_norm(rim, order, dim=1)[:, None]
-    meshes = [
-        (
-            torch.as_tensor(phi.surface.uv, dtype=torch.float32) @ turn,
-            torch.as_tensor(phi.surface.faces),
-        )
+    # no h_i may fold a triangle of any surface: F_{i→j} takes those of i through h_j
+    vertices = [
+        torch.as_tensor(phi.surface.uv, dtype=torch.float32) @ turn
         for phi, turn in zip(phis, turns, strict=True)
     ]
+    first = np.cumsum([0, *(len(v) for v in vertices[:-1])])
+    faces = np.concatenate([phi.surface.faces + n for phi, n in zip(phis, first, strict=True)])
+    mesh = (torch.cat(vertices), torch.as_tensor(faces))
     cut = all(len(phi.surface.twins) for phi in phis) and matched.on_boundary >= 2
     common = Matched([points.double().numpy()], matched.numbers, matched.on_boundary)
     seam = common.seam(config.domain, _SEAM_POINTS) if cut else np.zeros((0, 2, 2))
@@ -155,7 +156,7 @@ def build_collection_map(
             targets=targets,
             seam=torch.as_tensor(seam, dtype=torch.float32),
             turns=turns,
-            meshes=meshes,
+            mesh=mesh,
             phis=[phi.map for phi in phis],
         ),
     )

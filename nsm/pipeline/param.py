@@ -25,6 +25,7 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.surfaces.baselines import BASELINES
+from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 
 
@@ -85,7 +86,7 @@ def run_param(
     ours = result.metrics["nsm"]
     if ours["flipped_percent"] == 0 and ours["boundary_self_intersections"]:
         console.print(
-            "nothing is flipped, but the image overlaps itself; energy.boundary=fixed keeps it in Ω"
+            "nothing is flipped, but the image overlaps itself; constraints.boundary=fixed forbids"
         )
     console.print(f"results in {folder}", soft_wrap=True)
     return result
@@ -97,16 +98,20 @@ def build_param(config: DictConfig, phi: NeuralSurface) -> Param:
     Raises:
         NsmError: settings of the network, energy, optimiser or schedule that do not fit together.
     """
-    energy = config.energy
+    surface = phi.surface
+    mesh = (
+        torch.as_tensor(surface.uv, dtype=torch.float32),
+        torch.as_tensor(surface.faces),
+        torch.as_tensor(face_areas(surface.vertices, surface.faces), dtype=torch.float32),
+    )
     return built(
         config,
         lambda common: Param(
             **with_map(common),
             domain=config.domain,
-            weights={name: float(w) for name, w in energy.weights.items()},
-            lambda_injectivity=float(energy.lambda_injectivity),
-            lambda_boundary=float(energy.lambda_boundary),
-            boundary=energy.boundary,
+            weights={name: float(w) for name, w in config.energy.weights.items()},
+            **common["constraints"],
+            mesh=mesh,
             phi=phi.map,
         ),
     )

@@ -62,7 +62,8 @@ class SurfaceCollection:
         first = self.maps[source]
         turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
         nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
-        h = Between(_double(first), _double(self.maps[target]), nodes)
+        onto = first.inner.config.get("onto")  # type: ignore[union-attr, operator]
+        h = Between(_double(first), _double(self.maps[target]), nodes, onto)
         ids = self.landmarks[:, [source, target]]
         return SurfaceMap(
             self.surfaces[source], self.surfaces[target], h.eval(), ids, {}, self.config

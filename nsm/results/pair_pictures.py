@@ -19,7 +19,7 @@ from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces import Surface
 from nsm.surfaces.location import locate
 
-_STRIP, _GIF = 360, 420
+_STRIP, _GIF = 300, 300
 _WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
 
 
@@ -98,10 +98,12 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
     data = io.BytesIO()
     Image.fromarray(row).save(data, format="PNG")
     atomic_write(strip, data.getvalue())
-    frames = [Image.fromarray(draw(t, _GIF)) for t in np.linspace(0, 1, 13)]
+    frames = [Image.fromarray(draw(t, _GIF)) for t in np.linspace(0, 1, 9)]
     frames += frames[-2:0:-1]
     data = io.BytesIO()
-    frames[0].save(data, format="GIF", save_all=True, append_images=frames[1:], duration=90, loop=0)
+    frames[0].save(
+        data, format="GIF", save_all=True, append_images=frames[1:], duration=120, loop=0
+    )
     atomic_write(animation, data.getvalue())
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nsm.maps.planar import PlanarMap
+from nsm.maps import Planar, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.files import misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
@@ -31,7 +31,7 @@ class Parameterization:
     """
 
     phi: NeuralSurface
-    map: PlanarMap
+    map: Planar
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
 
@@ -66,7 +66,7 @@ def load_parameterization(folder: str | Path) -> Parameterization:
     phi = load_surface(folder)
     tensors, words = read_pair(stem, FORMAT, VERSION)
     try:
-        planar = PlanarMap(**words["map"])
+        planar = build_planar(words["map"])
         planar.load_state_dict(tensors)
         metrics, config = dict(words["metrics"]), dict(words["config"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:

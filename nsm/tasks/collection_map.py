@@ -32,7 +32,7 @@ class CollectionMap(pl.LightningModule):
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
         turns: (k, 2, 2) rotations of the inputs.
-        meshes: uv (V, 2), in the common domain, and faces (F, 3) of each surface.
+        mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         phis: the surfaces; none is trained.
 
     Raises:
@@ -62,11 +62,11 @@ class CollectionMap(pl.LightningModule):
         targets: Tensor,
         seam: Tensor,
         turns: Tensor,
-        meshes: Sequence[tuple[Tensor, Tensor]],
+        mesh: tuple[Tensor, Tensor],
         phis: Sequence[nn.Module],
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["phis", "points", "targets", "seam", "turns", "meshes"])
+        self.save_hyperparameters(ignore=["phis", "points", "targets", "seam", "turns", "mesh"])
         if not 0 <= ramp <= 1:
             raise ValueError(f"constraints.ramp {ramp} is not in [0, 1]")
         for value, known in ((boundary, BOUNDARIES), (landmarks, LANDMARKS)):
@@ -79,7 +79,7 @@ class CollectionMap(pl.LightningModule):
             Rotated(build_planar({**map, "onto": onto}), turn) for turn in turns
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
-        self.weakest = nn.ModuleList(Weakest(*mesh) for mesh in meshes)
+        self.weakest = nn.ModuleList(Weakest(*mesh) for _ in phis)
         self.domain = domain
         self.multiplier_every, self.ramp_steps = multiplier_every, ramp * max_steps
         self.lambdas = {

@@ -9,18 +9,20 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import blend, boundary, first_fundamental_form, injectivity
-from nsm.maps.planar import PlanarMap
+from nsm.energies import blend, first_fundamental_form, injectivity
+from nsm.maps import build_planar
 from nsm.tasks.optimizers import configure
+from nsm.tasks.weakest import Weakest
 
 BOUNDARIES = ("free", "fixed")
-_BOUNDARY_POINTS = 512
 
 
 class Param(pl.LightningModule):
-    """L = mean E(A, B) + λ_inv mean G(det J_h), A = J_φᵀJ_φ, B = J_hᵀJ_h (METHOD, Param).
+    """L = mean E(A, B) + λ_inv mean G(det J_h) + λ_tri U, A = J_φᵀJ_φ, B = J_hᵀJ_h (METHOD, Param).
 
-    With a fixed boundary, λ_B mean σ(h(∂Ω)) is added, and the image of ∂Ω slides on ∂Ω.
+    U keeps the mesh's triangles from folding (:class:`nsm.tasks.weakest.Weakest`). With a fixed
+    boundary h keeps to Ω by construction, and the image of ∂Ω slides on ∂Ω: a map that folds
+    nowhere is then bijective.
 
     Args:
         map: configuration of h's network.
@@ -28,8 +30,9 @@ class Param(pl.LightningModule):
         max_steps: length of the schedule.
         domain: ``disc`` or ``square``.
         weights: energies by name with their weights (see :mod:`nsm.energies`).
-        lambda_injectivity, lambda_boundary: λ_inv and λ_B.
+        lambda_injectivity, lambda_triangles: λ_inv and λ_tri.
         boundary: ``free`` or ``fixed``.
+        mesh: uv (V, 2), faces (F, 3) and areas (F,) of the mesh whose triangles must not flip.
         phi: the surface; it is not trained.
 
     Raises:
@@ -47,22 +50,20 @@ class Param(pl.LightningModule):
         domain: str,
         weights: dict[str, float],
         lambda_injectivity: float,
-        lambda_boundary: float,
+        lambda_triangles: float,
         boundary: str,
+        mesh: tuple[Tensor, Tensor, Tensor],
         phi: nn.Module,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["phi"])
+        self.save_hyperparameters(ignore=["phi", "mesh"])
         if boundary not in BOUNDARIES:
             raise ValueError(f"boundary {boundary!r} is not one of {', '.join(BOUNDARIES)}")
         self.energy = blend(weights)
-        self.map = PlanarMap(**map)
+        self.map = build_planar({**map, "onto": domain if boundary == "fixed" else None})
         self.phi = phi.eval().requires_grad_(False)
-        self.domain, self.fixed = domain, boundary == "fixed"
-        self.lambda_injectivity, self.lambda_boundary = lambda_injectivity, lambda_boundary
-        self.register_buffer("rim", _rim(domain), persistent=False)
-
-    rim: Tensor
+        self.lambda_injectivity, self.lambda_triangles = lambda_injectivity, lambda_triangles
+        self.weakest = Weakest(*mesh)
 
     def forward(self, uv: Tensor) -> Tensor:
         """(N, 2) points of Ω to the plane."""
@@ -74,10 +75,10 @@ class Param(pl.LightningModule):
         loss = distortion + self.lambda_injectivity * fold
         self.log("train/distortion", distortion)
         self.log("train/injectivity", fold)
-        if self.fixed:
-            off = boundary(self.domain, self.map(self.rim)).mean()
-            loss = loss + self.lambda_boundary * off
-            self.log("train/boundary", off)
+        if self.lambda_triangles > 0:
+            weak = self.weakest(self.map, self.global_step)
+            loss = loss + self.lambda_triangles * weak
+            self.log("train/triangles", weak)
         self.log("train/loss", loss)
         return loss
 
@@ -97,14 +98,3 @@ class Param(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)
-
-
-def _rim(domain: str) -> Tensor:
-    """Points (N, 2) all along ∂Ω."""
-    t = torch.arange(_BOUNDARY_POINTS) / _BOUNDARY_POINTS
-    if domain == "disc":
-        return torch.stack([torch.cos(2 * torch.pi * t), torch.sin(2 * torch.pi * t)], dim=1)
-    side, along = (4 * t).long(), 2 * (4 * t).frac() - 1
-    one = torch.ones_like(t)
-    points = [(along, -one), (one, along), (-along, one), (-one, -along)]
-    return torch.stack([torch.stack(p, dim=1) for p in points])[side, torch.arange(len(t))]

@@ -22,6 +22,7 @@ class Weakest(nn.Module):
     Args:
         uv: (V, 2) vertices of the mesh in Ω.
         faces: (F, 3), counter-clockwise.
+        areas: (F,) what counts as each triangle's own area; that in Ω by default.
     """
 
     uv: Tensor
@@ -29,11 +30,12 @@ class Weakest(nn.Module):
     area: Tensor
     chosen: Tensor
 
-    def __init__(self, uv: Tensor, faces: Tensor) -> None:
+    def __init__(self, uv: Tensor, faces: Tensor, areas: Tensor | None = None) -> None:
         super().__init__()
         self.register_buffer("uv", uv, persistent=False)
         self.register_buffer("faces", faces, persistent=False)
-        self.register_buffer("area", _double_areas(uv[faces]).clamp(min=1e-12), persistent=False)
+        double = _double_areas(uv[faces]) if areas is None else 2 * areas
+        self.register_buffer("area", double.clamp(min=1e-12), persistent=False)
         # in the state, so that resumed training goes on with the same ones
         self.register_buffer("chosen", torch.arange(min(_COUNT, len(faces))))
 

@@ -41,3 +41,12 @@ def test_between_two_maps_goes_through_the_common_domain():
     assert (between(first(x)) - second(x)).norm(dim=1).max() < 1e-8
     back = Between(second, first, disc(400, seed=1))
     assert (back(between(first(x))) - first(x)).norm(dim=1).max() < 1e-8
+
+
+def test_points_of_the_rim_come_back_to_the_rim():
+    h = stirred(4)
+    t = torch.linspace(0, 6.28, 200, dtype=torch.float64)
+    rim = torch.stack([t.cos(), t.sin()], dim=1)
+    back = Between(h, h, disc(400), "disc").back(rim)
+    assert (h(back) - rim).norm(dim=1).max() < 1e-8
+    assert (back.norm(dim=1) - 1).abs().max() < 1e-6

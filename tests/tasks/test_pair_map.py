@@ -206,7 +206,7 @@ def collection(names, points=NONE, targets=None, **changes):
         targets=torch.zeros(k, 0, 2) if targets is None else targets,
         seam=torch.zeros(0, 2, 2),
         turns=torch.eye(2).expand(k, 2, 2),
-        meshes=[MESH] * k,
+        mesh=MESH,
         phis=[surface(n) for n in names],
     )
 

@@ -1,0 +1,366 @@
+"""Maps between surfaces, as users run them: from meshes, ready surfaces, in Python, resumed."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+import nsm
+from nsm import cli
+from nsm.config import compose_config
+from nsm.errors import NsmError
+from nsm.pipeline.inputs import landmark_vertices
+from nsm.surfaces.geometry import point_mesh_distance
+from nsm.surfaces.together import Mesh
+
+QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
+MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'
+SEAM = "seam.path=shortest"
+POINTS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0.0]])
+
+
+def nearest(vertices, points):
+    return [int(np.linalg.norm(vertices - p, axis=1).argmin()) for p in points]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Two closed meshes of one shape, and their landmarks."""
+    folder = tmp_path_factory.mktemp("meshes")
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    egg = trimesh.creation.icosphere(subdivisions=3)
+    ids = {"ball": nearest(ball.vertices, POINTS), "egg": nearest(egg.vertices, POINTS)}
+    egg.vertices = egg.vertices * [1.3, 1.0, 0.9]
+    ball.export(folder / "ball.obj")
+    egg.export(folder / "egg.obj")
+    for name, listed in ids.items():
+        (folder / f"{name}.vts").write_text("".join(f"{i} 0 0 0\n" for i in listed))
+    pairs = list(zip(ids["ball"], ids["egg"], strict=True))
+    (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
+    return folder
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["nsm", *words])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+        out, err = capfd.readouterr()
+        return status, out, err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def made(files, tmp_path_factory):
+    """A whole run from raw meshes with landmarks."""
+    folder = tmp_path_factory.mktemp("run") / "map"
+    f = nsm.map_pair(
+        files / "ball.obj",
+        files / "egg.obj",
+        files / "pairs.json",
+        overrides=[*QUICK, MADE, SEAM, "trainer.max_steps=200"],
+        folder=folder,
+        progress=False,
+    )
+    return folder, f
+
+
+def test_a_map_of_meshes_meets_its_landmarks_without_flips(made):
+    _, f = made
+    assert f.metrics["flipped_percent"] == 0
+    assert f.metrics["outside_percent"] == 0
+    assert f.metrics["landmark_error_max_percent"] < 0.5
+    assert f.metrics["symmetric_dirichlet_median"] < 5
+    assert f.metrics["covered_percent"] > 99
+    assert f.metrics["boundary_distance_max"] < 1e-6
+
+
+def test_a_run_leaves_all_that_the_readme_names(made):
+    folder, _ = made
+    for name in (
+        "metrics.json",
+        "config.yaml",
+        "pair.safetensors",
+        "mapped.obj",
+        "mapped_vertices.npy",
+        "target_with_source_uv.glb",
+        "source_with_target_uv.glb",
+        "transfer.png",
+        "distortion.png",
+        "morph.png",
+        "morph.gif",
+        "morph/08.obj",
+    ):
+        assert (folder / name).stat().st_size > 0, name
+
+
+def test_a_map_is_given_back_as_it_was(made):
+    folder, f = made
+    again = nsm.load(folder)
+    assert isinstance(again, nsm.SurfaceMap)
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.abs(again(points) - f(points)).max() < 1e-6
+    assert again.metrics == f.metrics
+    assert (again.landmarks == f.landmarks).all()
+
+
+def test_points_go_to_the_target_in_its_own_units(made, files):
+    _, f = made
+    ball = trimesh.load(files / "ball.obj", process=False)
+    egg = trimesh.load(files / "egg.obj", process=False)
+    points = ball.triangles_center
+    image = f(points)
+    assert point_mesh_distance(image, np.asarray(egg.vertices), egg.faces).max() < 1e-6
+    # landmarks go to landmarks, in the units of the files
+    ids = f.landmarks
+    off = np.linalg.norm(f(ball.vertices[ids[:, 0]]) - egg.vertices[ids[:, 1]], axis=1)
+    assert off.max() < 0.02
+
+
+def test_values_are_carried_over_and_back(made, files):
+    _, f = made
+    ball = trimesh.load(files / "ball.obj", process=False)
+    colours = np.asarray(ball.vertices) * 0.5 + 0.5
+    there = f.transfer(colours)
+    egg = trimesh.load(files / "egg.obj", process=False)
+    assert there.shape == (len(egg.vertices), 3)
+    again = f.transfer(there, back=True)
+    assert np.abs(again - colours).mean() < 0.02
+    labels = (np.asarray(ball.vertices)[:, 0] > 0).astype(int)
+    carried = f.transfer(labels)
+    assert carried.dtype == labels.dtype and set(np.unique(carried)) == {0, 1}
+    with pytest.raises(ValueError, match="rows"):
+        f.transfer(colours[:10])
+
+
+def test_a_morph_begins_at_the_source_and_ends_at_the_image(made):
+    _, f = made
+    assert (f.morph(0.0) == f.source.surface.vertices).all()
+    end, image = f.morph(1.0), f.image
+    # a rigid motion keeps all distances
+    edges = f.source.surface.faces[:, :2]
+    lengths = [np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (end, image)]
+    assert np.abs(lengths[0] - lengths[1]).max() < 1e-9
+
+
+def test_figures_agree_with_an_independent_count(made):
+    _, f = made
+    s = f.source.surface
+    a, b, c = (np.c_[f.image_uv, np.zeros(len(s.uv))][s.faces[:, k]] for k in range(3))
+    flipped = (np.cross(b - a, c - a)[:, 2] <= 0).mean()
+    assert f.metrics["flipped_percent"] == 100 * flipped
+    # symmetric Dirichlet by singular values of each triangle's affine map
+    values = []
+    for x, y in zip(s.vertices[s.faces], f.image[s.faces], strict=True):
+        e, g = np.stack([x[1] - x[0], x[2] - x[0]], 1), np.stack([y[1] - y[0], y[2] - y[0]], 1)
+        q, r = np.linalg.qr(e)
+        sigma = np.linalg.svd(g @ np.linalg.inv(r), compute_uv=False)
+        values.append((sigma**2).sum() + (1 / (sigma**2 + 0.01)).sum())
+    assert f.metrics["symmetric_dirichlet_median"] == pytest.approx(np.median(values), rel=1e-6)
+
+
+def test_neural_surfaces_that_are_ready_are_mapped_as_they_are(made):
+    _, f = made
+    again = nsm.map_pair(
+        f.source,
+        f.target,
+        f.landmarks.tolist(),
+        overrides=[*QUICK, "trainer.max_steps=20"],
+        progress=False,
+    )
+    assert again.source is f.source
+    assert again.metrics["landmark_error_max_percent"] < 5
+
+
+@pytest.mark.parametrize("domain", ["disc", "square"])
+def test_analytic_targets_and_no_landmarks(command, domain):
+    status, out, err = command(
+        "task=pair_map",
+        "source=hemisphere",
+        "target={name: graph, z: 0.3*u*v}",
+        f"domain={domain}",
+        *QUICK,
+        MADE,
+        "trainer.max_steps=60",
+        "logger=none",
+    )
+    assert status == 0, err
+    folder = out.strip().splitlines()[-1].removeprefix("results in ")
+    f = nsm.load(folder)
+    assert f.target.surface.name == "graph"
+    assert f.metrics["flipped_percent"] == 0 and f.metrics["outside_percent"] == 0
+
+
+def test_attributes_of_files_are_carried_by_the_command(command, tmp_path):
+    count = len(nsm.Surface.load("hemisphere").vertices)
+    np.save(tmp_path / "heat.npy", np.linspace(0, 1, count))
+    words = ["task=pair_map", "source=hemisphere", "target=sphere_cap", *QUICK, MADE]
+    words += ["trainer.max_steps=10", "logger=none"]
+    status, out, err = command(*words, "attributes.source=heat.npy")
+    assert status == 0, err
+    folder = out.strip().splitlines()[-1].removeprefix("results in ")
+    carried = np.load(f"{folder}/heat_on_target.npy")
+    assert carried.min() >= 0 and carried.max() <= 1 and carried.std() > 0.1
+
+
+def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch):
+    _, f = made
+    words = [*QUICK, "trainer.max_steps=100", "logger=none"]
+
+    def run(folder, **extra):
+        from nsm.pipeline import run_pair_map
+
+        config = compose_config(["task=pair_map", "trainer.progress=false", *words])
+        return run_pair_map(config, folder, f.source, f.target, f.landmarks.tolist(), **extra)
+
+    whole = run(tmp_path / "whole")
+    # the same, stopped in the middle: the checkpoint of step 50
+    from nsm.results import callbacks
+
+    written = callbacks.AtomicCheckpoint.on_validation_epoch_end
+
+    def stop(self, trainer, module):
+        written(self, trainer, module)
+        if trainer.global_step == 50:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_validation_epoch_end", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "parted")
+    monkeypatch.undo()
+    resumed = run(tmp_path / "parted", resuming=True)
+    assert (resumed.image_uv == whole.image_uv).all()
+
+
+@pytest.fixture(scope="module")
+def trio():
+    return nsm.map_collection(
+        ["hemisphere", "saddle", "cone"],
+        overrides=[*QUICK, MADE, "trainer.max_steps=150"],
+        progress=False,
+    )
+
+
+def test_a_collection_maps_every_surface_to_every_other(trio):
+    assert len(trio.metrics["pairs"]) == 6
+    for figures in trio.metrics["pairs"].values():
+        assert figures["flipped_percent"] == 0
+        assert figures["symmetric_dirichlet_median"] < 6
+    assert trio.metrics["cycle_error_mean_percent"] < 0.05
+
+
+def test_the_maps_of_a_collection_are_inverse_to_each_other(trio):
+    there, back = trio.pair(0, 2), trio.pair(2, 0)
+    points = trio.surfaces[0].in_original_units(trio.surfaces[0].surface.vertices[::5])
+    again = back(there(points))
+    assert np.median(np.linalg.norm(again - points, axis=1)) < 1e-4
+
+
+def test_a_collection_is_given_back(trio, tmp_path):
+    trio.save(tmp_path)
+    again = nsm.load(tmp_path)
+    assert isinstance(again, nsm.SurfaceCollection)
+    assert np.abs(again.pair(0, 1).image_uv - trio.pair(0, 1).image_uv).max() < 1e-9
+    (tmp_path / "collection.safetensors").write_bytes(b"short")
+    with pytest.raises(NsmError, match="truncated"):
+        nsm.load(tmp_path)
+
+
+def test_closed_shapes_are_put_into_a_collection_through_their_landmarks(files):
+    names = ["ball", "egg", "ball"]
+    group = nsm.map_collection(
+        [files / f"{n}.obj" for n in names],
+        [files / f"{n}.vts" for n in names],
+        overrides=[*QUICK, MADE, SEAM, "trainer.max_steps=100"],
+        progress=False,
+    )
+    for figures in group.metrics["pairs"].values():
+        assert figures["flipped_percent"] == 0
+        assert figures["landmark_error_max_percent"] < 2
+
+
+BAD = [
+    (["landmarks=[[99999,1]]"], "99999"),
+    (["landmarks=[[1,1],[1,2]]"], "are both vertex 1"),
+    (["landmarks=[a.vts,b.vts]"], "a has 1, b has 2"),
+    (["landmarks=nowhere.json"], "nowhere.json"),
+    (["landmarks=broken.json"], "not readable as JSON"),
+    (["landmarks=[[[9.0,9.0,9.0],1]]"], "away from the mesh"),
+    (["target=null"], "setting target"),
+    (["target={name: spere_cap}"], "sphere_cap"),
+    (["target=ready", "domain=square"], "domain=square"),
+    (["target=cut"], "truncated"),
+    (["target=old"], "version"),
+    (["constraints.boundary=soft"], "soft"),
+    (["seam.path=sideways"], "sideways"),
+    (["attributes.source=a.vts"], "attributes.source"),
+]
+
+
+@pytest.fixture(scope="module")
+def bad_files(made, files, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad")
+    ready, _ = made
+    shutil.copytree(ready / "target", folder / "ready")
+    shutil.copytree(ready / "target", folder / "cut")
+    whole = (folder / "cut" / "surface.safetensors").read_bytes()
+    (folder / "cut" / "surface.safetensors").write_bytes(whole[: len(whole) // 2])
+    shutil.copytree(ready / "target", folder / "old")
+    words = json.loads((folder / "old" / "surface.json").read_text())
+    (folder / "old" / "surface.json").write_text(json.dumps({**words, "version": 99}))
+    (folder / "a.vts").write_text("1 0 0 0\n")
+    (folder / "b.vts").write_text("1 0 0 0\n2 0 0 0\n")
+    (folder / "broken.json").write_text("[[1, 2")
+    for name, mesh in (("a", "ball"), ("b", "egg")):
+        shutil.copy(files / f"{mesh}.obj", folder / f"{name}.obj")
+    return folder
+
+
+@pytest.mark.parametrize(("words", "told"), BAD, ids=[" ".join(w) for w, _ in BAD])
+def test_bad_input_is_told_in_one_line(command, bad_files, monkeypatch, words, told):
+    monkeypatch.chdir(bad_files)
+    quick = [*QUICK, MADE, "trainer.max_steps=1", "logger=none", "trainer.progress=false"]
+    if words == ["seam.path=sideways"]:
+        words = [*words, "landmarks=[[1,1],[5,5]]"]
+    status, _, err = command("task=pair_map", "source=a.obj", "target=b.obj", *quick, *words)
+    assert status == 2
+    assert told in err and len(err.strip().splitlines()) == 1, err
+
+
+def test_a_collection_needs_three_surfaces(command):
+    status, _, err = command("task=collection_map", "surfaces=[saddle,cone]")
+    assert status == 2 and "three surfaces" in err
+
+
+def test_landmarks_come_in_many_forms(tmp_path):
+    vertices = np.arange(30, dtype=float).reshape(10, 3)
+    shapes = [
+        Mesh("a", vertices, np.zeros((0, 3), int)),
+        Mesh("b", vertices, np.zeros((0, 3), int)),
+    ]
+    (tmp_path / "a.txt").write_text("1\n2\n")
+    (tmp_path / "pairs.json").write_text("[[1, 3], [2, 4]]")
+    forms = [
+        [[1, 3], [2, 4]],
+        np.array([[1, 3], [2, 4]]).tolist(),
+        {"source": [1, 2], "target": [3, 4]},
+        str(tmp_path / "pairs.json"),
+        [[vertices[1].tolist(), 3], [vertices[2].tolist(), 4]],
+    ]
+    for form in forms:
+        a, b = landmark_vertices(form, shapes)
+        assert a.tolist() == [1, 2] and b.tolist() == [3, 4]
+    both = landmark_vertices([str(tmp_path / "a.txt")] * 2, shapes)
+    assert both[0].tolist() == both[1].tolist() == [1, 2]
+    assert [len(x) for x in landmark_vertices(None, shapes)] == [0, 0]
