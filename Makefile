@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench bench-maps clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -18,6 +18,10 @@ check: .venv/.nsm-dev
 # Error against time, default beside paper settings: about an hour. MESHES names the folder.
 bench: .venv/.nsm-dev
 	$(BIN)/python benchmarks/overfit.py $(if $(MESHES),--meshes $(MESHES))
+
+# Maps between the meshes of the folder MESHES, and flattening beside libigl's: over an hour.
+bench-maps: .venv/.nsm-dev
+	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -112,7 +112,21 @@ def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
             if words or group == "setting":
                 key = f"{group}: {name}"
                 result[key] = lambda words=words: pair(*study, words)  # type: ignore[misc]
+    for name in ("shrec07-384.off", "cow.obj"):
+        for kind in ("free", "fixed"):
+            file = str(meshes / name)
+            result[f"param: {name.split('.')[0]} {kind}"] = (  # type: ignore[misc]
+                lambda file=file, kind=kind: flattened(file, kind)
+            )
     return result
+
+
+def flattened(file: str, boundary: str) -> dict[str, Any]:
+    """Figures of flattening, with those of libigl's methods on the same cut mesh."""
+    phi = nsm.overfit(nsm.Surface.load(file), progress=False)
+    words = [f"constraints.boundary={boundary}"]
+    flat, seconds = timed(lambda: nsm.parameterize(phi, overrides=words, progress=False))
+    return {"map_seconds": seconds, "flattening": flat.metrics}
 
 
 COLUMNS = {
@@ -135,11 +149,36 @@ def table() -> str:
     ]
     for file in sorted(RESULTS.glob("*.json")):
         words = json.loads(file.read_text())
+        if "flattening" in words:
+            continue
         rows = words["metrics"].get("pairs", {words["case"]: words["metrics"]})
         for name, metrics in rows.items():
             label = name if rows is not words["metrics"].get("pairs") else f"collection: {name}"
             values = " | ".join(f"{metrics[key]:.3f}" for key in COLUMNS)
             lines.append(f"| {label} | {values} | {words['map_seconds']:.0f} |")
+    return "\n".join(lines) + "\n"
+
+
+FLAT = {
+    "symmetric_dirichlet_median": "median",
+    "symmetric_dirichlet_mean": "mean",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_percent": "flipped %",
+    "boundary_self_intersections": "overlaps",
+}
+
+
+def flat_table() -> str:
+    """The same for flattening, a row for each method."""
+    lines = [
+        "| surface | method | " + " | ".join(FLAT.values()) + " |",
+        "|---" * (len(FLAT) + 2) + "|",
+    ]
+    for file in sorted(RESULTS.glob("param*.json")):
+        words = json.loads(file.read_text())
+        for method, metrics in words["flattening"].items():
+            values = " | ".join(f"{metrics[key]:.3f}" for key in FLAT)
+            lines.append(f"| {words['case'].removeprefix('param: ')} | {method} | {values} |")
     return "\n".join(lines) + "\n"
 
 
@@ -163,8 +202,9 @@ def main() -> None:
             **run(),
         }
         file.write_text(json.dumps(words, indent=2) + "\n")
-    (RESULTS.parent / "maps.md").write_text(table())
-    print(table())
+    text = f"{table()}\n{flat_table()}"
+    (RESULTS.parent / "maps.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def _place(
         yield compose_config(words), Path(folder)
         return
     with tempfile.TemporaryDirectory(prefix="nsm-") as temporary:
-        yield compose_config([*words, "logger=none"]), Path(temporary)
+        yield compose_config([*words, "logger=none", "artefacts=false"]), Path(temporary)
 
 
 def load(

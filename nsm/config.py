@@ -112,6 +112,7 @@ class Schema:
     logger: LoggerSchema = field(default_factory=LoggerSchema)
     domain: str = MISSING
     seed: int = MISSING
+    artefacts: bool = MISSING
     resume: str | None = None
 
 

@@ -97,7 +97,9 @@ def run_collection_map(
     maps = [h.cpu().eval().requires_grad_(False) for h in module.map]
     result = SurfaceCollection(phis, maps, np.stack(ids, axis=1), {}, settings)
     result.metrics.update(collection_metrics(result, points, matched.points))
-    _write(folder, result)
+    result.save(folder)
+    if config.artefacts:
+        _write_artefacts(folder, result)
     names = [phi.surface.name for phi in phis]
     figures = {"surfaces": names, "landmarks": len(ids[0]), "metrics": result.metrics}
     write_figures(folder, first, trainer, started, figures)
@@ -163,8 +165,7 @@ def build_collection_map(
     return module, points.double().numpy(), turns
 
 
-def _write(folder: Path, collection: SurfaceCollection) -> None:
-    collection.save(folder)
+def _write_artefacts(folder: Path, collection: SurfaceCollection) -> None:
     figures_picture(folder / "figures.png", collection)
     transfer_matrix_picture(folder / "transfer.png", collection)
     for i, source in enumerate(collection.surfaces):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import time
@@ -22,6 +21,7 @@ from nsm.data import OverfitData
 from nsm.errors import NsmError
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
+from nsm.results.files import as_json
 from nsm.results.progress import TrainingProgress
 from nsm.surfaces import Surface
 
@@ -157,7 +157,11 @@ def fitted(
     atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
     # killed before the first checkpoint, a run starts again from its beginning
     checkpoint = folder / CHECKPOINT_FILE
-    _fit(trainer, module, data, checkpoint if resuming and checkpoint.is_file() else None)
+    try:
+        _fit(trainer, module, data, checkpoint if resuming and checkpoint.is_file() else None)
+    except SystemExit:  # what Lightning makes of an interrupt
+        if not trainer.interrupted:
+            raise
     if trainer.interrupted:
         console.print(f"interrupted; go on with: nsm resume={folder}", soft_wrap=True)
         raise KeyboardInterrupt
@@ -201,4 +205,4 @@ def write_figures(
         "preparation": surface.quality,
         **figures,
     }
-    atomic_write(folder / "metrics.json", (json.dumps(words, indent=2) + "\n").encode())
+    atomic_write(folder / "metrics.json", as_json(words))

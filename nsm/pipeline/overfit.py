@@ -50,6 +50,7 @@ _INCIDENTAL = (
     "surfaces",
     "landmarks",
     "attributes",
+    "artefacts",
     "seam",
     "constraints",
 )
@@ -95,7 +96,9 @@ def run_overfit(
     )
     phi = module.map.cpu().eval().requires_grad_(False)
     neural = NeuralSurface(surface, phi, overfit_metrics(surface, phi), plain(config))
-    _write_surface(folder, neural)
+    save_surface(folder, neural)
+    if config.artefacts:
+        _write_artefacts(folder, neural)
     write_figures(folder, surface, trainer, started, {"metrics": neural.metrics})
     console.print(metrics_table(neural.metrics))
     console.print(f"results in {folder}", soft_wrap=True)
@@ -125,7 +128,13 @@ def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralS
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
-    words = ["task=overfit", "logger=none", f"domain={config.domain}", f"seed={config.seed}"]
+    words = [
+        "task=overfit",
+        "logger=none",
+        "artefacts=false",
+        f"domain={config.domain}",
+        f"seed={config.seed}",
+    ]
     progress = f"trainer.progress={str(config.trainer.progress).lower()}"
     overfit = compose_config([*words, progress, *config.phi.overrides])
     settings = {k: v for k, v in plain(overfit).items() if k not in _INCIDENTAL}
@@ -154,8 +163,7 @@ def build_overfit(config: DictConfig, surface: Surface) -> Overfit:
     )
 
 
-def _write_surface(folder: Path, neural: NeuralSurface) -> None:
-    save_surface(folder, neural)
+def _write_artefacts(folder: Path, neural: NeuralSurface) -> None:
     vertices, faces, uv = neural.to_mesh()
     export_mesh(folder / "reconstruction.obj", vertices, faces, uv)
     export_mesh(folder / "reconstruction.glb", vertices, faces, uv, texture=checkerboard())

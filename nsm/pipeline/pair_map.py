@@ -94,7 +94,9 @@ def run_pair_map(
     result.metrics.update(
         pair_metrics(phi.surface, psi.surface, result.image_uv, evaluate(h, points), targets)
     )
-    _write(folder, result)
+    result.save(folder)
+    if config.artefacts:
+        _write_artefacts(folder, result)
     transfer_attributes(settings["attributes"], folder, result)
     write_figures(
         folder,
@@ -147,8 +149,7 @@ def build_pair_map(
     )
 
 
-def _write(folder: Path, f: SurfaceMap) -> None:
-    f.save(folder)
+def _write_artefacts(folder: Path, f: SurfaceMap) -> None:
     s, t = f.source.surface, f.target.surface
     image = f.target.in_original_units(f.image)
     np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))

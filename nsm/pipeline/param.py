@@ -74,13 +74,8 @@ def run_param(
         result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
 
     result.save(folder)
-    inside = _into_square(result.uv)
-    for ending, texture in (("obj", None), ("glb", checkerboard())):
-        file = folder / f"parameterized.{ending}"
-        export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
-    picture_file = folder / "checkerboard.png"
-    before_after = {"before: domain Ω": maps["domain"], "after": maps["nsm"]}
-    parameterization_picture(picture_file, surface, before_after)
+    if config.artefacts:
+        _write_artefacts(folder, result)
     write_figures(folder, surface, trainer, started, {"metrics": result.metrics})
     console.print(comparison_table(result.metrics))
     ours = result.metrics["nsm"]
@@ -90,6 +85,17 @@ def run_param(
         )
     console.print(f"results in {folder}", soft_wrap=True)
     return result
+
+
+def _write_artefacts(folder: Path, result: Parameterization) -> None:
+    surface = result.phi.surface
+    inside = _into_square(result.uv)
+    for ending, texture in (("obj", None), ("glb", checkerboard())):
+        file = folder / f"parameterized.{ending}"
+        export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
+    picture_file = folder / "checkerboard.png"
+    before_after = {"before: domain Ω": surface.uv, "after": result.uv}
+    parameterization_picture(picture_file, surface, before_after)
 
 
 def build_param(config: DictConfig, phi: NeuralSurface) -> Param:

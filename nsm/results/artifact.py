@@ -45,7 +45,7 @@ class NeuralSurface:
     def __call__(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 2) of Ω to points (N, 3) of the surface; numpy for numpy, torch for torch."""
         if isinstance(uv, Tensor):
-            return self.map(uv)
+            return self.map(self._fit(uv)).to(uv.dtype)
         return evaluate(self.map, np.asarray(uv))
 
     @overload
@@ -55,8 +55,13 @@ class NeuralSurface:
     def jacobian(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Jacobians (N, 3, 2) at points (N, 2) of Ω."""
         if isinstance(uv, Tensor):
-            return self.map.value_and_jacobian(uv)[1]  # type: ignore[operator]
+            return self.map.value_and_jacobian(self._fit(uv))[1].to(uv.dtype)  # type: ignore[operator]
         return evaluate_jacobian(self.map, np.asarray(uv))[1]
+
+    def _fit(self, uv: Tensor) -> Tensor:
+        """Points in the type of the network's weights; the caller's type is given back."""
+        weight = next(self.map.parameters(), None)
+        return uv if weight is None else uv.to(weight.dtype)
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2)."""
@@ -104,7 +109,7 @@ def load_surface(folder: str | Path) -> NeuralSurface:
         NsmError: files that are missing, truncated, damaged, or of another version.
     """
     path = Path(folder)
-    if path.name == f"{STEM}.safetensors":
+    if path.name in (f"{STEM}.safetensors", f"{STEM}.json"):
         path = path.parent
     tensors, words = read_pair(path / STEM, FORMAT, VERSION)
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Mapping
@@ -56,8 +57,20 @@ def write_pair(
     data = save(dict(tensors))
     head = {"format": form, "version": version, "sha256": hashlib.sha256(data).hexdigest()}
     atomic_write(stem.with_suffix(".safetensors"), data)
-    text = json.dumps({**head, **words}, indent=2) + "\n"
-    atomic_write(stem.with_suffix(".json"), text.encode())
+    atomic_write(stem.with_suffix(".json"), as_json({**head, **words}))
+
+
+def as_json(words: Any) -> bytes:
+    """JSON text that every reader takes: figures that are not finite become null."""
+    return (json.dumps(_finite(words), indent=2, allow_nan=False) + "\n").encode()
+
+
+def _finite(words: Any) -> Any:
+    if isinstance(words, Mapping):
+        return {key: _finite(value) for key, value in words.items()}
+    if isinstance(words, (list, tuple)):
+        return [_finite(value) for value in words]
+    return None if isinstance(words, float) and not math.isfinite(words) else words
 
 
 def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -69,7 +82,7 @@ def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], d
     file = stem.with_suffix(".json")
     try:
         words = json.loads(_read(file))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise NsmError(f"{file}: not readable as JSON; make the run again") from error
     if not isinstance(words, dict) or words.get("format") != form:
         raise NsmError(f"{file}: not of format {form}; give the folder of a run that made one")

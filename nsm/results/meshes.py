@@ -30,17 +30,19 @@ def export_mesh(
     """
     target = Path(path)
     coordinates = 0.5 * (np.asarray(uv) + 1)
-    if target.suffix == ".glb":
+    if target.suffix.lower() == ".glb":
         atomic_write(target, _glb(vertices, faces, coordinates, texture))
         return
-    if target.suffix != ".obj":
+    if target.suffix.lower() != ".obj":
         raise NsmError(f"{target}: meshes are written as .obj or .glb")
     head = ""
     if texture is not None:
         picture = io.BytesIO()
         texture.save(picture, format="PNG")
-        atomic_write(target.with_suffix(".png"), picture.getvalue())
-        material = f"newmtl surface\nKd 1 1 1\nmap_Kd {target.stem}.png\n"
+        # a name of its own: a picture beside the mesh may well be called as the mesh is
+        texture_file = target.with_name(f"{target.stem}_texture.png")
+        atomic_write(texture_file, picture.getvalue())
+        material = f"newmtl surface\nKd 1 1 1\nmap_Kd {texture_file.name}\n"
         atomic_write(target.with_suffix(".mtl"), material.encode())
         head = f"mtllib {target.stem}.mtl\nusemtl surface\n"
     lines = [head]

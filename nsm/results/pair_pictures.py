@@ -20,6 +20,7 @@ from nsm.surfaces import Surface
 from nsm.surfaces.location import locate
 
 _STRIP, _GIF = 300, 300
+_TICKS = [4, 5, 7, 10, 20]
 _WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
 
 
@@ -75,12 +76,16 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     )
     axes = figure.axes[2]
     axes.clear()
+    axes.set_aspect("auto")
     axes.set_position((0.64, 0.14, 0.24, 0.74))
     axes.hist(np.clip(value, 4, _WORST), bins=np.geomspace(4, _WORST, 60), color="#345c8c")
     axes.set_xscale("log")
-    axes.set_xticks([4, 5, 7, 10, 20], ["4", "5", "7", "10", "≥ 20"])
+    axes.set_xticks(_TICKS, [*map(str, _TICKS[:-1]), f"≥ {_TICKS[-1]}"])
+    axes.set_xticks([], minor=True)
     axes.set_title(f"triangles; median {np.median(value):.2f}")
-    figure.colorbar(scale, cax=figure.add_axes((0.91, 0.2, 0.012, 0.6)), extend="max")
+    bar = figure.colorbar(scale, cax=figure.add_axes((0.91, 0.2, 0.012, 0.6)), extend="max")
+    bar.set_ticks(_TICKS, labels=map(str, _TICKS))
+    bar.ax.set_yticks([], minor=True)
     save_figure(figure, path)
 
 

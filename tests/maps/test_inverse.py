@@ -44,7 +44,7 @@ def test_between_two_maps_goes_through_the_common_domain():
 
 
 def test_points_of_the_rim_come_back_to_the_rim():
-    h = stirred(4)
+    h = stirred(4, scale=0.08)
     t = torch.linspace(0, 6.28, 200, dtype=torch.float64)
     rim = torch.stack([t.cos(), t.sin()], dim=1)
     back = Between(h, h, disc(400), "disc").back(rim)

@@ -194,6 +194,7 @@ def test_analytic_targets_and_no_landmarks(command, domain):
         MADE,
         "trainer.max_steps=60",
         "logger=none",
+        "artefacts=false",
     )
     assert status == 0, err
     folder = out.strip().splitlines()[-1].removeprefix("results in ")
@@ -206,7 +207,7 @@ def test_attributes_of_files_are_carried_by_the_command(command, tmp_path):
     count = len(nsm.Surface.load("hemisphere").vertices)
     np.save(tmp_path / "heat.npy", np.linspace(0, 1, count))
     words = ["task=pair_map", "source=hemisphere", "target=sphere_cap", *QUICK, MADE]
-    words += ["trainer.max_steps=10", "logger=none"]
+    words += ["trainer.max_steps=10", "logger=none", "artefacts=false"]
     status, out, err = command(*words, "attributes.source=heat.npy")
     assert status == 0, err
     folder = out.strip().splitlines()[-1].removeprefix("results in ")
@@ -216,7 +217,7 @@ def test_attributes_of_files_are_carried_by_the_command(command, tmp_path):
 
 def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch):
     _, f = made
-    words = [*QUICK, "trainer.max_steps=100", "logger=none"]
+    words = [*QUICK, "trainer.max_steps=100", "logger=none", "artefacts=false"]
 
     def run(folder, **extra):
         from nsm.pipeline import run_pair_map
@@ -228,14 +229,14 @@ def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch)
     # the same, stopped in the middle: the checkpoint of step 50
     from nsm.results import callbacks
 
-    written = callbacks.AtomicCheckpoint.on_validation_epoch_end
+    written = callbacks.AtomicCheckpoint.on_train_epoch_end
 
     def stop(self, trainer, module):
         written(self, trainer, module)
         if trainer.global_step == 50:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_validation_epoch_end", stop)
+    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "parted")
     monkeypatch.undo()
@@ -331,6 +332,7 @@ def bad_files(made, files, tmp_path_factory):
 def test_bad_input_is_told_in_one_line(command, bad_files, monkeypatch, words, told):
     monkeypatch.chdir(bad_files)
     quick = [*QUICK, MADE, "trainer.max_steps=1", "logger=none", "trainer.progress=false"]
+    quick.append("artefacts=false")
     if words == ["seam.path=sideways"]:
         words = [*words, "landmarks=[[1,1],[5,5]]"]
     status, _, err = command("task=pair_map", "source=a.obj", "target=b.obj", *quick, *words)

@@ -285,3 +285,37 @@ def test_pictures_survive_a_map_that_is_not_a_number(neural, tmp_path):
         for parameter in neural.map.parameters():
             parameter.fill_(float("nan"))
     assert (reconstruction_image(neural.surface, neural.map, size=32) == 255).all()
+
+
+def test_points_in_either_precision_are_answered_in_theirs(neural):
+    for dtype in (torch.float32, torch.float64):
+        uv = torch.zeros(3, 2, dtype=dtype)
+        assert neural(uv).dtype == dtype
+        assert neural.jacobian(uv).dtype == dtype
+
+
+def test_figures_that_are_not_finite_are_written_as_standard_json():
+    from nsm.results.files import as_json
+
+    words = {"a": [float("nan"), 1.0], "b": {"c": float("inf")}}
+    assert json.loads(as_json(words)) == {"a": [None, 1.0], "b": {"c": None}}
+
+
+def test_deeply_nested_json_is_refused(neural, tmp_path):
+    save_surface(tmp_path, neural)
+    (tmp_path / "surface.json").write_text("[" * 100_000)
+    with pytest.raises(NsmError, match="not readable as JSON"):
+        load_surface(tmp_path)
+
+
+def test_a_surface_is_loaded_by_either_of_its_files(neural, tmp_path):
+    save_surface(tmp_path, neural)
+    for name in ("surface.json", "surface.safetensors"):
+        assert load_surface(tmp_path / name).metrics == neural.metrics
+
+
+def test_a_texture_does_not_take_the_name_of_another_picture(neural, tmp_path):
+    (tmp_path / "shape.png").write_bytes(b"mine")
+    export_mesh(tmp_path / "shape.OBJ", *neural.to_mesh(), texture=checkerboard(64))
+    assert (tmp_path / "shape.png").read_bytes() == b"mine"
+    assert "shape_texture.png" in (tmp_path / "shape.mtl").read_text()
