@@ -1,9 +1,13 @@
 """Fixtures for all tests."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+from nsm import cli
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -27,3 +31,22 @@ def shared_meshes() -> Path:
     if not folder.is_dir():
         pytest.skip("no folder of classic models; set NSM_MESHES to one")
     return folder
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, capfd):
+    """Run the command within this process, in a folder of its own: imports take seconds."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
+
+    def call(*words: str) -> subprocess.CompletedProcess:
+        monkeypatch.setattr(sys, "argv", ["nsm", *words])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+        out, err = capfd.readouterr()
+        return subprocess.CompletedProcess(words, status, out, err)
+
+    return call

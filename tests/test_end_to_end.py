@@ -15,7 +15,6 @@ import torch
 import trimesh
 
 import nsm
-from nsm import cli
 
 QUICK = [
     "experiment=quick",
@@ -34,25 +33,6 @@ def run(folder: Path, *words: str, **extra) -> subprocess.CompletedProcess:
     return subprocess.run(
         command(*words), cwd=folder, env=environment, capture_output=True, text=True, **extra
     )
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch, capfd):
-    """Run the command within this process, in a folder of its own: imports take seconds."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
-
-    def call(*words: str) -> subprocess.CompletedProcess:
-        monkeypatch.setattr(sys, "argv", ["nsm", *words])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            status = int(stop.code or 0)
-        out, err = capfd.readouterr()
-        return subprocess.CompletedProcess(words, status, out, err)
-
-    return call
 
 
 def only_run_folder(folder: Path) -> Path:

@@ -10,21 +10,32 @@ from torch import Tensor, nn
 from nsm.maps.networks import NeuralMap
 
 
-class PlanarMap(nn.Module):
+class _FromIdentity(nn.Module):
+    """A map made of a network whose output layer is zero at the start."""
+
+    out_dim: int
+    onto: str | None = None  # the domain that the map keeps to by construction
+
+    def __init__(self, **config: Any) -> None:
+        super().__init__()
+        self.network = NeuralMap(**{**config, "out_dim": self.out_dim})
+        nn.init.zeros_(self.network.output.weight)
+        nn.init.zeros_(self.network.output.bias)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What the map is built from (see :func:`build_planar`)."""
+        return {**self.network.config, "onto": self.onto}
+
+
+class PlanarMap(_FromIdentity):
     """h(x) = x + N(x), with a network N whose output layer is zero at the start.
 
     Args:
         **config: of the network (see :class:`nsm.maps.NeuralMap`); ``out_dim`` is 2.
     """
 
-    def __init__(self, **config: Any) -> None:
-        super().__init__()
-        self.network = _network_of_zeros(config, out_dim=2)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """What the map is built from."""
-        return self.network.config
+    out_dim = 2
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
@@ -36,7 +47,7 @@ class PlanarMap(nn.Module):
         return x + value, torch.eye(2, dtype=x.dtype, device=x.device) + jacobian
 
 
-class DiscMap(nn.Module):
+class DiscMap(_FromIdentity):
     """h(x) = R(θ(x))·(x + (1 − ‖x‖²)·N(x)): the circle goes to itself, whatever N and θ are.
 
     The boundary constraint (METHOD, B) holds by construction, and the image of ∂Ω slides by θ.
@@ -45,14 +56,8 @@ class DiscMap(nn.Module):
         **config: of the network (N, θ); ``out_dim`` is 3.
     """
 
-    def __init__(self, **config: Any) -> None:
-        super().__init__()
-        self.network = _network_of_zeros(config, out_dim=3)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """What the map is built from."""
-        return {**self.network.config, "onto": "disc"}
+    out_dim = 3
+    onto = "disc"
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
@@ -75,21 +80,15 @@ class DiscMap(nn.Module):
         return _turned(y, c, s), torch.stack(columns, dim=2)
 
 
-class SquareMap(nn.Module):
+class SquareMap(_FromIdentity):
     """h_i(x) = x_i + (1 − x_i²)·N_i(x): each side of the square goes to itself, corners stay.
 
     Args:
         **config: of the network N; ``out_dim`` is 2.
     """
 
-    def __init__(self, **config: Any) -> None:
-        super().__init__()
-        self.network = _network_of_zeros(config, out_dim=2)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """What the map is built from."""
-        return {**self.network.config, "onto": "square"}
+    out_dim = 2
+    onto = "square"
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
@@ -121,13 +120,6 @@ def build_planar(config: dict[str, Any]) -> Planar:
     if onto not in _ONTO:
         raise ValueError(f"onto {onto!r} is not a domain")
     return _ONTO[onto](**network)
-
-
-def _network_of_zeros(config: dict[str, Any], out_dim: int) -> NeuralMap:
-    network = NeuralMap(**{**config, "out_dim": out_dim})
-    nn.init.zeros_(network.output.weight)
-    nn.init.zeros_(network.output.bias)
-    return network
 
 
 def _turned(y: Tensor, c: Tensor, s: Tensor) -> Tensor:

@@ -9,29 +9,43 @@ from typing import Any
 import numpy as np
 
 from nsm.errors import NsmError
-from nsm.results import SurfaceMap, atomic_write
+from nsm.results import SurfaceMap, atomic_write, on_cut_mesh
+from nsm.surfaces import Surface
 
 
-def transfer_attributes(settings: dict[str, Any], folder: Path, f: SurfaceMap) -> None:
-    """Carry over the arrays of ``attributes.source`` and ``attributes.target``.
+def read_attributes(
+    settings: dict[str, Any], source: Surface, target: Surface
+) -> dict[str, np.ndarray]:
+    """The arrays of ``attributes.source`` and ``attributes.target``, by these words.
 
-    Each is a .npy file with a row for each vertex of its mesh file; the result lies in the folder
-    as ``NAME_on_target.npy`` or ``NAME_on_source.npy``.
+    Each is a .npy file with a row for each vertex of its mesh file.
 
     Raises:
         NsmError: a file that is no such array.
     """
-    for key, back, end in (("source", False, "target"), ("target", True, "source")):
+    result = {}
+    for key, surface in (("source", source), ("target", target)):
         if settings[key] is None:
             continue
-        file = Path(settings[key])
         try:
-            moved = f.transfer(np.load(file, allow_pickle=False), back=back)
-        except (OSError, ValueError) as error:
+            values = np.load(settings[key], allow_pickle=False)
+            on_cut_mesh(surface, values)
+        except (OSError, ValueError, EOFError) as error:
             reason = " ".join(str(error).split())[:160]
             raise NsmError(
-                f"attributes.{key}={file}: {reason}; give a .npy array with a row for each vertex"
+                f"attributes.{key}={settings[key]}: {reason}; give a .npy array with a row for "
+                "each vertex"
             ) from error
+        result[key] = values
+    return result
+
+
+def write_transferred(
+    attributes: dict[str, np.ndarray], settings: dict[str, Any], folder: Path, f: SurfaceMap
+) -> None:
+    """Carry the arrays over, into NAME_on_target.npy and NAME_on_source.npy in the folder."""
+    for key, values in attributes.items():
+        end = "target" if key == "source" else "source"
         data = io.BytesIO()
-        np.save(data, moved)
-        atomic_write(folder / f"{file.stem}_on_{end}.npy", data.getvalue())
+        np.save(data, f.transfer(values, back=key == "target"))
+        atomic_write(folder / f"{Path(settings[key]).stem}_on_{end}.npy", data.getvalue())

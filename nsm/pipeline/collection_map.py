@@ -153,7 +153,7 @@ def build_collection_map(
             **with_map(settings),
             domain=config.domain,
             weights={name: float(w) for name, w in config.energy.weights.items()},
-            **settings["constraints"],
+            constraints=settings["constraints"],
             points=points,
             targets=targets,
             seam=torch.as_tensor(seam, dtype=torch.float32),

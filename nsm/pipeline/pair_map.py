@@ -14,7 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from nsm.pipeline.attributes import transfer_attributes
+from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.common import built, plain, train, with_map, write_figures
 from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.results import (
@@ -65,6 +65,8 @@ def run_pair_map(
     started = time.monotonic()
     for key in ("source", "target", "landmarks"):
         config[key] = absolute_paths(config[key])  # resuming works from any folder
+    for key in ("source", "target"):
+        config.attributes[key] = absolute_paths(config.attributes[key])
     settings = plain(config)
     shapes = [
         read_shape(settings[key] if given is None else given, config.domain, key)
@@ -72,6 +74,7 @@ def run_pair_map(
     ]
     ids = landmark_vertices(settings["landmarks"] if landmarks is None else landmarks, shapes)
     phi, psi = neural_surfaces(config, shapes, ids, console)
+    attributes = read_attributes(settings["attributes"], phi.surface, psi.surface)
     matched = matched_landmarks([phi.surface, psi.surface], ids)
     module = build_pair_map(config, phi, psi, matched)
     points, targets = matched.points
@@ -97,7 +100,7 @@ def run_pair_map(
     result.save(folder)
     if config.artefacts:
         _write_artefacts(folder, result)
-    transfer_attributes(settings["attributes"], folder, result)
+    write_transferred(attributes, settings["attributes"], folder, result)
     write_figures(
         folder,
         phi.surface,
@@ -137,7 +140,7 @@ def build_pair_map(
             **with_map(common),
             domain=config.domain,
             weights={name: float(w) for name, w in config.energy.weights.items()},
-            **common["constraints"],
+            constraints=common["constraints"],
             points=p,
             targets=q,
             seam=seam,

@@ -23,7 +23,7 @@ from nsm.results.pictures import (
     parameterization_picture,
     reconstruction_image,
 )
-from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map
+from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map, on_cut_mesh
 from nsm.results.tables import collection_table, comparison_table, metrics_table, pair_table
 from nsm.results.textures import checkerboard
 
@@ -56,6 +56,7 @@ __all__ = [
     "load_parameterization",
     "load_surface",
     "metrics_table",
+    "on_cut_mesh",
     "overfit_metrics",
     "parameterization_picture",
     "planar_metrics",

@@ -2,14 +2,12 @@
 
 import json
 import shutil
-import sys
 
 import numpy as np
 import pytest
 import trimesh
 
 import nsm
-from nsm import cli
 from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline.inputs import landmark_vertices
@@ -41,23 +39,6 @@ def files(tmp_path_factory):
     pairs = list(zip(ids["ball"], ids["egg"], strict=True))
     (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
     return folder
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["nsm", *words])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            status = int(stop.code or 0)
-        out, err = capfd.readouterr()
-        return status, out, err
-
-    return call
 
 
 @pytest.fixture(scope="module")
@@ -184,8 +165,8 @@ def test_neural_surfaces_that_are_ready_are_mapped_as_they_are(made):
 
 
 @pytest.mark.parametrize("domain", ["disc", "square"])
-def test_analytic_targets_and_no_landmarks(command, domain):
-    status, out, err = command(
+def test_analytic_targets_and_no_landmarks(here, domain):
+    run = here(
         "task=pair_map",
         "source=hemisphere",
         "target={name: graph, z: 0.3*u*v}",
@@ -196,21 +177,21 @@ def test_analytic_targets_and_no_landmarks(command, domain):
         "logger=none",
         "artefacts=false",
     )
-    assert status == 0, err
-    folder = out.strip().splitlines()[-1].removeprefix("results in ")
+    assert run.returncode == 0, run.stderr
+    folder = run.stdout.strip().splitlines()[-1].removeprefix("results in ")
     f = nsm.load(folder)
     assert f.target.surface.name == "graph"
     assert f.metrics["flipped_percent"] == 0 and f.metrics["outside_percent"] == 0
 
 
-def test_attributes_of_files_are_carried_by_the_command(command, tmp_path):
+def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
     count = len(nsm.Surface.load("hemisphere").vertices)
     np.save(tmp_path / "heat.npy", np.linspace(0, 1, count))
     words = ["task=pair_map", "source=hemisphere", "target=sphere_cap", *QUICK, MADE]
     words += ["trainer.max_steps=10", "logger=none", "artefacts=false"]
-    status, out, err = command(*words, "attributes.source=heat.npy")
-    assert status == 0, err
-    folder = out.strip().splitlines()[-1].removeprefix("results in ")
+    run = here(*words, "attributes.source=heat.npy")
+    assert run.returncode == 0, run.stderr
+    folder = run.stdout.strip().splitlines()[-1].removeprefix("results in ")
     carried = np.load(f"{folder}/heat_on_target.npy")
     assert carried.min() >= 0 and carried.max() <= 1 and carried.std() > 0.1
 
@@ -329,20 +310,20 @@ def bad_files(made, files, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("words", "told"), BAD, ids=[" ".join(w) for w, _ in BAD])
-def test_bad_input_is_told_in_one_line(command, bad_files, monkeypatch, words, told):
+def test_bad_input_is_told_in_one_line(here, bad_files, monkeypatch, words, told):
     monkeypatch.chdir(bad_files)
     quick = [*QUICK, MADE, "trainer.max_steps=1", "logger=none", "trainer.progress=false"]
     quick.append("artefacts=false")
     if words == ["seam.path=sideways"]:
         words = [*words, "landmarks=[[1,1],[5,5]]"]
-    status, _, err = command("task=pair_map", "source=a.obj", "target=b.obj", *quick, *words)
-    assert status == 2
-    assert told in err and len(err.strip().splitlines()) == 1, err
+    run = here("task=pair_map", "source=a.obj", "target=b.obj", *quick, *words)
+    assert run.returncode == 2
+    assert told in run.stderr and len(run.stderr.strip().splitlines()) == 1, run.stderr
 
 
-def test_a_collection_needs_three_surfaces(command):
-    status, _, err = command("task=collection_map", "surfaces=[saddle,cone]")
-    assert status == 2 and "three surfaces" in err
+def test_a_collection_needs_three_surfaces(here):
+    run = here("task=collection_map", "surfaces=[saddle,cone]")
+    assert run.returncode == 2 and "three surfaces" in run.stderr
 
 
 def test_landmarks_come_in_many_forms(tmp_path):

@@ -22,6 +22,9 @@ SETTINGS = {
     "max_steps": 200,
     "domain": "disc",
     "weights": {"symmetric_dirichlet": 1.0},
+    "constraints": {},
+}
+HELD = {
     "lambda_injectivity": 100.0,
     "lambda_boundary": 1e3,
     "lambda_landmarks": 10.0,
@@ -37,6 +40,13 @@ _POINTS, _FACES = ring_mesh(8)
 MESH = (torch.as_tensor(_POINTS, dtype=torch.float32), torch.as_tensor(_FACES))
 
 
+def settings(changes):
+    """The settings with changes, whether of the constraints or of the rest."""
+    held = {**HELD, **{k: v for k, v in changes.items() if k in HELD}}
+    rest = {k: v for k, v in changes.items() if k not in HELD}
+    return {**SETTINGS, "constraints": held, **rest}
+
+
 def samples(n=256, seed=0):
     g = torch.Generator().manual_seed(seed)
     r, t = torch.rand(n, generator=g).sqrt(), 2 * torch.pi * torch.rand(n, generator=g)
@@ -46,7 +56,7 @@ def samples(n=256, seed=0):
 def pair(phi, psi, points=NONE, targets=NONE, turn=None, **changes):
     torch.manual_seed(0)
     return PairMap(
-        **{**SETTINGS, **changes},
+        **settings(changes),
         points=points,
         targets=targets,
         seam=torch.zeros(0, 2, 2),
@@ -127,8 +137,14 @@ def test_multipliers_meet_landmarks_better_than_a_fixed_weight():
     points, targets = torch.tensor([[0.3, 0.1]]), torch.tensor([[0.0, 0.1]])
     off = {}
     for kind in ("augmented", "fixed"):
-        module = pair(surface("plane"), surface("plane"), points, targets, landmarks=kind)
-        module.lambdas["landmarks"] = 10.0
+        module = pair(
+            surface("plane"),
+            surface("plane"),
+            points,
+            targets,
+            landmarks=kind,
+            lambda_landmarks=10.0,
+        )
         off[kind] = (optimise(module, 800, every=25)(points) - targets).norm().item()
     assert off["augmented"] < 0.3 * off["fixed"]
 
@@ -175,7 +191,7 @@ def test_the_seam_term_draws_both_copies_together():
     seam = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
     torch.manual_seed(0)
     module = PairMap(
-        **{**SETTINGS, "lambda_seam": 10.0},
+        **settings({"lambda_seam": 10.0}),
         points=NONE,
         targets=NONE,
         seam=seam,
@@ -201,7 +217,7 @@ def collection(names, points=NONE, targets=None, **changes):
     torch.manual_seed(0)
     k = len(names)
     return CollectionMap(
-        **{**SETTINGS, **changes},
+        **settings(changes),
         points=points,
         targets=torch.zeros(k, 0, 2) if targets is None else targets,
         seam=torch.zeros(0, 2, 2),
@@ -212,7 +228,7 @@ def collection(names, points=NONE, targets=None, **changes):
 
 
 def test_a_collection_of_equal_surfaces_starts_at_the_minimum():
-    energy, determinant = collection(["saddle"] * 3)._distortion(samples())
+    energy, determinant, _ = collection(["saddle"] * 3)._distortion(samples())
     assert energy.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
     assert determinant.shape == (3, 256)
 
@@ -220,7 +236,7 @@ def test_a_collection_of_equal_surfaces_starts_at_the_minimum():
 def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
     module = collection(["plane", "sphere_cap"])
     x = samples(4096)
-    energy, _ = module._distortion(x)
+    energy, _, _ = module._distortion(x)
     forth, _, _ = pair(surface("plane"), surface("sphere_cap"))._distortion(x)
     cap = surface("sphere_cap")
     area = torch.linalg.det((j := cap.value_and_jacobian(x)[1]).transpose(1, 2) @ j).sqrt()
@@ -279,3 +295,12 @@ def test_folded_triangles_are_unfolded():
 
 def nearest(x):
     return torch.cdist(x, MESH[0]).argmin(dim=1)
+
+
+def test_a_collection_held_by_penalties_pulls_strays_back():
+    module = collection(["plane", "saddle", "plane"], boundary="penalty")
+    module.log = lambda *a, **k: None
+    assert torch.isfinite(module.training_step(1.5 * samples(), 0))
+    inner = module._distortion(samples())[0]
+    mixed = module._distortion(torch.cat([samples(), 2 + samples()]))[0]
+    assert mixed.item() == pytest.approx(inner.item(), rel=1e-5)
