@@ -32,11 +32,13 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.results.metrics import evaluate
+from nsm.surfaces.shapes import grid_mesh, ring_mesh
 from nsm.surfaces.together import Matched, matched_landmarks
 from nsm.tasks import CollectionMap
 from nsm.tasks.start import landmark_rotation, least_distorting_rotation
 
 _SEAM_POINTS = 24  # on each branch
+_RINGS = 80  # of an even mesh of the common domain
 
 
 def run_collection_map(
@@ -136,13 +138,17 @@ def build_collection_map(
     order = 2 if config.domain == "disc" else float("inf")
     rim = points[: matched.on_boundary]
     points[: matched.on_boundary] = rim / torch.linalg.vector_norm(rim, order, dim=1)[:, None]
-    # no h_i may fold a triangle of any surface: F_{i→j} takes those of i through h_j
+    # no h_i may fold a triangle of any surface, as F_{i→j} takes those of i through h_j; nor fold
+    # anywhere between them, where samples are rare, or its inverse would be lost
+    even, even_faces = ring_mesh(_RINGS) if config.domain == "disc" else grid_mesh(2 * _RINGS)
     vertices = [
         torch.as_tensor(phi.surface.uv, dtype=torch.float32) @ turn
         for phi, turn in zip(phis, turns, strict=True)
     ]
+    vertices.append(torch.as_tensor(even, dtype=torch.float32))
     first = np.cumsum([0, *(len(v) for v in vertices[:-1])])
-    faces = np.concatenate([phi.surface.faces + n for phi, n in zip(phis, first, strict=True)])
+    parts = [*(phi.surface.faces for phi in phis), even_faces]
+    faces = np.concatenate([part + n for part, n in zip(parts, first, strict=True)])
     mesh = (torch.cat(vertices), torch.as_tensor(faces))
     cut = all(len(phi.surface.twins) for phi in phis) and matched.on_boundary >= 2
     common = Matched([points.double().numpy()], matched.numbers, matched.on_boundary)
