@@ -134,6 +134,10 @@ def build_pair_map(
     else:
         some = uv[:: len(uv) // 4096 + 1]
         turn = least_distorting_rotation(config.domain, phi.map, psi.map, some)
+    if config.domain == "square" and config.constraints["boundary"] == "penalty":
+        # the exact boundary keeps corners by construction; here they are key points (METHOD)
+        corners = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        p, q = torch.cat([p, corners]), torch.cat([q, corners @ turn.T])
     return built(
         config,
         lambda common: PairMap(

@@ -184,6 +184,26 @@ def test_analytic_targets_and_no_landmarks(here, domain):
     assert f.metrics["flipped_percent"] == 0 and f.metrics["outside_percent"] == 0
 
 
+def test_penalties_keep_the_corners_of_the_square_as_key_points(on_the_square):
+    f = on_the_square
+    corners = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    from nsm.results.metrics import evaluate
+
+    moved = evaluate(f.map, corners)
+    off = np.linalg.norm(moved[:, None] - corners[None], axis=2).min(axis=1)
+    assert off.max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def on_the_square():
+    return nsm.map_pair(
+        "saddle",
+        "plane",
+        overrides=[*QUICK, MADE, "domain=square", "constraints=paper_pair", "trainer.max_steps=60"],
+        progress=False,
+    )
+
+
 def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
     count = len(nsm.Surface.load("hemisphere").vertices)
     np.save(tmp_path / "heat.npy", np.linspace(0, 1, count))
