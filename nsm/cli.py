@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from pathlib import Path
@@ -14,6 +15,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nsm.config import checked, conf_folder, one_line, register_resolvers
 from nsm.errors import NsmError
+
+# What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
+# input. Imported only when called for.
+COMMANDS: dict[str, str] = {}
 
 
 def _run(config: DictConfig) -> bool:
@@ -36,6 +41,23 @@ def _run(config: DictConfig) -> bool:
 
 def main() -> None:
     """Entry point. Exit status 0, 2 for bad input (one line on stderr) or 130 if interrupted."""
+    if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
+        _command(COMMANDS[sys.argv[1]], sys.argv[2:])
+    else:
+        _tasks()
+
+
+def _command(module: str, words: list[str]) -> None:
+    try:
+        importlib.import_module(module).main(words)
+    except NsmError as error:
+        _say(str(error))
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _tasks() -> None:
     register_resolvers()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach us instead of being printed
     results: list[bool] = []
