@@ -2,38 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
-import torch
 from torch import nn
 
+from nsm.results.evaluation import evaluate, evaluate_jacobian
+from nsm.results.wrinkles import normal_variation
 from nsm.surfaces import Surface
 from nsm.surfaces.geometry import point_mesh_distance, subdivide
 
-_CHUNK = 16_384
 # A triangle whose area φ shrinks below this share of the true one has collapsed.
 DEGENERATE_STRETCH = 1e-3
-
-
-def evaluate(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
-    """φ at points (N, 2) of Ω, as float64 (N, 3)."""
-    with torch.no_grad():
-        return torch.cat([phi(chunk) for chunk in _chunks(phi, uv)]).double().cpu().numpy()
-
-
-def evaluate_jacobian(phi: nn.Module, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """φ (N, 3) and its Jacobian (N, 3, 2) at points (N, 2) of Ω, as float64."""
-    with torch.no_grad():
-        parts = [phi.value_and_jacobian(chunk) for chunk in _chunks(phi, uv)]  # type: ignore[operator]
-        values, jacobians = (torch.cat(part).double().cpu() for part in zip(*parts, strict=True))
-    return values.detach().numpy(), jacobians.detach().numpy()
-
-
-def _chunks(phi: nn.Module, uv: np.ndarray) -> Iterator[torch.Tensor]:
-    like = next(phi.parameters(), torch.zeros(0))
-    for start in range(0, max(len(uv), 1), _CHUNK):
-        yield torch.as_tensor(uv[start : start + _CHUNK], dtype=like.dtype, device=like.device)
 
 
 def vertex_error(surface: Surface, phi: nn.Module) -> np.ndarray:
@@ -59,7 +37,8 @@ def overfit_metrics(
         rms_percent and max_percent at matching uv; hausdorff_mesh_to_phi_percent and
         hausdorff_phi_to_mesh_percent, one-sided; normal_error_mean_degrees,
         normal_error_p95_degrees; degenerate_triangles_percent; seam_gap_percent, the largest
-        distance between the images of two seam vertices that were one point.
+        distance between the images of two seam vertices that were one point; and the figures of
+        :func:`nsm.results.wrinkles.normal_variation`.
     """
     to_percent = 100 / surface.bounding_box_diagonal
     corners = surface.vertices[surface.faces]
@@ -91,6 +70,7 @@ def overfit_metrics(
         "normal_error_p95_degrees": float(np.percentile(angle, 95)),
         "degenerate_triangles_percent": 100 * _degenerate_share(surface, phi, double_area),
         "seam_gap_percent": float(gap.max() * to_percent),
+        **normal_variation(surface, phi, seed=seed),
     }
 
 

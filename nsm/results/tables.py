@@ -16,6 +16,8 @@ _ROWS = {
     "normal_error_p95_degrees": ("normal error, 95th percentile", "degrees"),
     "degenerate_triangles_percent": ("degenerate triangles", "%"),
     "seam_gap_percent": ("largest gap along the seam", "% of diagonal"),
+    "normal_variation_error_degrees": ("normal variation, error", "degrees over 1 %"),
+    "normal_variation_excess_degrees": ("normal variation, excess", "degrees over 1 %"),
 }
 
 

@@ -1,0 +1,103 @@
+"""Wrinkles of a neural surface: how much more its normal turns than the source's.
+
+A network can be near its mesh everywhere and still be creased. A distance does not see that, and a
+normal error mixes it with slow deviations, which are no wrinkles. What is compared here is how the
+normal changes over a short way, on φ and on the source.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import nn
+
+from nsm.results.evaluation import evaluate_jacobian
+from nsm.surfaces import Surface
+from nsm.surfaces.location import Places, locate
+
+# length of the short way, of the diagonal of the mesh's bounding box
+DISTANCE = 0.01
+
+
+def normal_variation(
+    surface: Surface,
+    phi: nn.Module,
+    *,
+    distance: float = DISTANCE,
+    samples: int = 20_000,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Compare how the normal changes over a short way on φ and on the source mesh.
+
+    Points p are uniform by area on the mesh; q is the mesh's point nearest to p moved by
+    ``distance`` in a random tangential direction. With n the unit normal of φ at the same uv, m
+    that of the mesh (its vertex normals, interpolated, so that its flat triangles are no wrinkles),
+    and Δn = n(q) - n(p), Δm likewise: lengths of differences of unit normals, read as angles in
+    radians, which they are while small; where φ has no normal, 180 degrees.
+
+    Args:
+        surface: the prepared surface.
+        phi: the network, with ``value_and_jacobian``.
+        distance: length of the way, of the diagonal of the mesh's bounding box.
+        samples: how many ways.
+        seed: of these; they are never the points of a training.
+
+    Returns:
+        normal_variation_error_degrees, the root mean square of Δn - Δm: 0 for a φ that bends as
+        the source does; normal_variation_excess_degrees, RMS of Δn less RMS of Δm: above 0 a
+        surface more wrinkled than its source, below 0 one that smooths the source's detail over.
+    """
+    start, end = _ways(surface, distance * surface.bounding_box_diagonal, samples, seed)
+    smooth = _vertex_normals(surface)
+    there, mesh = [], []
+    for places in (start, end):
+        jacobian = evaluate_jacobian(phi, places.take(surface.uv, surface.faces))[1]
+        there.append(_unit(np.cross(jacobian[:, :, 0], jacobian[:, :, 1])))
+        mesh.append(_unit(places.take(smooth, surface.faces)))
+    # where the mesh itself has no normal, nothing can be compared
+    known = np.isfinite(mesh[0] + mesh[1]).all(axis=1)
+    turned, source = ((a[1] - a[0])[known] for a in (there, mesh))
+    return {
+        "normal_variation_error_degrees": _rms_degrees(turned - source),
+        "normal_variation_excess_degrees": _rms_degrees(turned) - _rms_degrees(source),
+    }
+
+
+def _ways(surface: Surface, length: float, count: int, seed: int) -> tuple[Places, Places]:
+    random = np.random.default_rng([seed, 0xBE5D])
+    corners = surface.vertices[surface.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    face = random.choice(len(area), size=count, p=area / area.sum())
+    start = Places(face, random.dirichlet(np.ones(3), size=count))
+    along = _unit(corners[face, 1] - corners[face, 0])
+    across = np.cross(_unit(cross[face]), along)
+    angle = random.uniform(0, 2 * np.pi, size=(count, 1))
+    direction = np.cos(angle) * along + np.sin(angle) * across
+    points = start.take(surface.vertices, surface.faces)
+    return start, locate(points + length * direction, surface.vertices, surface.faces)
+
+
+def _vertex_normals(surface: Surface) -> np.ndarray:
+    """Area-weighted normals (V, 3); a vertex that the cut doubled has one normal on both sides."""
+    corners = surface.vertices[surface.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = len(surface.vertices)
+    links = coo_matrix((np.ones(len(surface.twins)), tuple(surface.twins.T)), shape=(size, size))
+    point = connected_components(links, directed=False)[1]
+    total = np.zeros((size, 3))
+    np.add.at(total, point[surface.faces].ravel(), np.repeat(cross, 3, axis=0))
+    return _unit(total[point])
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (N, 3) at length 1; not a number where one has no direction."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _rms_degrees(vectors: np.ndarray) -> float:
+    """RMS length of vectors (N, 3), read as radians; where there is no normal it counts as π."""
+    length = np.linalg.norm(vectors, axis=1)
+    return float(np.degrees(np.sqrt((np.where(np.isfinite(length), length, np.pi) ** 2).mean())))
