@@ -244,7 +244,8 @@ def _open_handles(
     # two faces that share two edges: the dual tree may cross only one of them, the longer
     order = np.lexsort((-loop_length[crossing], high, low))
     keep = order[np.unique(low[order] * n_faces + high[order], return_index=True)[1]]
-    weight = 1.0 + loop_length.max() - loop_length[crossing[keep]]
+    longest = loop_length.max()  # relative to it, so that the unit of length is all the same
+    weight = 1.0 + (longest - loop_length[crossing[keep]]) / longest
     dual = csr_matrix((weight, (low[keep], high[keep])), shape=(n_faces, n_faces))
     tree = minimum_spanning_tree(dual).tocoo()
     crossed_pairs = set(

@@ -20,7 +20,14 @@ from nsm.surfaces.loading import check_arrays
 # eyeballs behind a face, and are dropped; above, which part is meant is the user's to say.
 DROPPED_SHARE = 0.05
 DROPPED_TOTAL = 0.10
-DEGENERATE_AREA = 1e-14  # relative to the squared diagonal of the bounding box
+# A face is collapsed if its height over its longest side is below twice this share of the bounding
+# box's diagonal, about what the digits of its coordinates can tell. A small face is none for that.
+DEGENERATE_HEIGHT = 1e-14
+# Neighbours this close, in shares of the diagonal, are one vertex written down twice.
+COINCIDENT = 1e-13
+# Of coordinates and of the bounding box, in the file's unit: results are written in single
+# precision too, which holds no more.
+LARGEST, SMALLEST = 1e30, 1e-30
 
 
 @dataclass(frozen=True)
@@ -43,10 +50,12 @@ def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanM
     vertices = np.asarray(vertices, dtype=np.float64)
     faces = np.asarray(faces, dtype=np.int64)
     check_arrays(vertices, faces, name)
+    _check_size(vertices, faces, name)
     log: list[str] = []
     count = len(vertices)
 
     representative = _merge_coincident(vertices, faces, log)
+    representative = _merge_near(vertices, representative, faces, log)
     unreferenced = len(np.setdiff1d(representative, representative[faces]))
     if unreferenced:
         log.append(f"{unreferenced} unreferenced vertices removed")
@@ -77,6 +86,16 @@ def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanM
     return CleanMesh(vertices[old], split_faces, old, index[representative], tuple(log))
 
 
+def _check_size(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
+    used = vertices[np.unique(faces)]
+    largest = float(np.abs(used).max())
+    if largest > LARGEST or 0 < np.ptp(used, axis=0).max() < SMALLEST:
+        raise NsmError(
+            f"{name}: too {'large' if largest > LARGEST else 'small'} for single precision "
+            f"(coordinates up to {largest:.3g}); scale the mesh"
+        )
+
+
 def _merge_coincident(vertices: np.ndarray, faces: np.ndarray, log: list[str]) -> np.ndarray:
     """For each vertex (V,) the first vertex at exactly its place, or itself where none is merged.
 
@@ -89,15 +108,9 @@ def _merge_coincident(vertices: np.ndarray, faces: np.ndarray, log: list[str]) -
     duplicates = len(vertices) - len(first)
     if duplicates == 0:
         return keep
-    joined = representative[faces]
-    joined = joined[_distinct_corners(joined)]
-    joined = joined[_first_uses(joined)]
-    apart = faces[_distinct_corners(faces)]
     soup = len(faces) > 1 and len(np.unique(faces)) == faces.size
-    if (
-        not soup
-        and len(joined)
-        and topology.edges_of(joined).count.max() > 2 >= topology.edges_of(apart).count.max()
+    if not soup and _most_faces_at_an_edge(representative[faces]) > 2 >= _most_faces_at_an_edge(
+        faces
     ):
         log.append(
             f"{duplicates} coincident vertices left apart: joined, edges would have three faces"
@@ -105,6 +118,39 @@ def _merge_coincident(vertices: np.ndarray, faces: np.ndarray, log: list[str]) -
         return keep
     log.append(f"{duplicates} coincident vertices merged")
     return representative
+
+
+def _merge_near(
+    vertices: np.ndarray, representative: np.ndarray, faces: np.ndarray, log: list[str]
+) -> np.ndarray:
+    """The representatives (V,), with vertices that an edge of all but no length joins made one.
+
+    Left as they are if edges of three faces would come of it.
+    """
+    joined = representative[faces]
+    pairs = topology.edges_of(joined).pairs
+    used = vertices[np.unique(joined)]
+    limit = COINCIDENT * float(np.linalg.norm(np.ptp(used, axis=0)))
+    length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    short = pairs[(length <= limit) & (pairs[:, 0] != pairs[:, 1])]
+    if len(short) == 0:
+        return representative
+    n = len(vertices)
+    graph = coo_matrix((np.ones(len(short)), tuple(short.T)), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    nearest = np.unique(label, return_index=True)[1][label][representative]
+    if _most_faces_at_an_edge(nearest[faces]) > 2 >= _most_faces_at_an_edge(joined):
+        return representative
+    count = len(np.unique(joined)) - len(np.unique(nearest[faces]))
+    log.append(f"{count} vertices merged with neighbours at no distance")
+    return nearest
+
+
+def _most_faces_at_an_edge(faces: np.ndarray) -> int:
+    """Over all edges, of faces that have three corners and are not there twice."""
+    faces = faces[_distinct_corners(faces)]
+    faces = faces[_first_uses(faces)]
+    return int(topology.edges_of(faces).count.max()) if len(faces) else 0
 
 
 def _distinct_corners(faces: np.ndarray) -> np.ndarray:
@@ -124,18 +170,25 @@ def _drop_bad_faces(
     vertices: np.ndarray, faces: np.ndarray, name: str, log: list[str]
 ) -> np.ndarray:
     diagonal = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
-    limit = DEGENERATE_AREA * diagonal**2
+    limit = DEGENERATE_HEIGHT * diagonal
     distinct = _distinct_corners(faces)
     if not distinct.all():
         log.append(f"{int((~distinct).sum())} faces with a repeated vertex removed")
     faces = faces[distinct]
-    flat = topology.face_areas(vertices, faces) <= limit
+    flat = _collapsed(vertices, faces, limit)
     if flat.all():
         raise NsmError(f"{name}: every face has zero area; give a mesh that is not collapsed")
     if flat.any():
         # taking a sliver out of the middle would tear a hole: only its removal by an edge flip
         # keeps the surface closed
+        before = topology.euler_characteristic(faces[_first_uses(faces)])
         faces, flipped, removed = _remove_slivers(vertices, faces, flat, limit)
+        kept = faces[_first_uses(faces)]
+        if len(kept) == 0 or topology.euler_characteristic(kept) != before:
+            raise NsmError(
+                f"{name}: {removed} faces of zero area cannot be taken out without tearing the "
+                "surface; merge vertices by distance in a mesh editor"
+            )
         if flipped:
             log.append(f"{flipped} zero-area faces removed by edge flips")
         if removed:
@@ -146,10 +199,17 @@ def _drop_bad_faces(
     return faces[first]
 
 
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, limit: float) -> np.ndarray:
+    """Mask (F,) of the faces whose height over their longest side is below twice the limit."""
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
+    return topology.face_areas(vertices, faces) <= limit * longest
+
+
 def _remove_slivers(
     vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray, limit: float
 ) -> tuple[np.ndarray, int, int]:
-    """Flip the longest edge of each face of area <= limit into its neighbour, or drop the face.
+    """Flip the longest edge of each collapsed face into its neighbour, or drop the face.
 
     A sliver between slivers may become flippable once its neighbour is; so they are gone through
     until none changes. Returns the faces, how many were flipped and how many dropped.
@@ -193,7 +253,7 @@ def _flip(
     if s == r or faces_at.get((min(r, s), max(r, s))):
         return None
     pair = np.array([(r, p, s), (r, s, q)], dtype=np.int64)
-    if (topology.face_areas(vertices, pair) <= limit).any():
+    if _collapsed(vertices, pair, limit).any():
         return None
     for h, new in zip((f, g), pair, strict=True):
         for edge in _sides(faces[h].tolist()):

@@ -163,3 +163,35 @@ def test_what_needs_a_decision_is_refused_in_one_line(mesh, words):
         clean(*mesh, "shape")
     assert str(caught.value).startswith("shape: ")
     assert "\n" not in str(caught.value)
+
+
+def test_small_faces_beside_a_long_spike_are_kept():
+    """Their area is nothing beside the square of the diagonal, but they are the shape."""
+    vertices, faces = ball()
+    vertices[5] *= 1e7
+    mesh = clean(vertices, faces)
+    assert np.array_equal(mesh.faces, faces)
+    assert mesh.log == ()
+
+
+def test_a_vertex_that_was_written_down_twice_is_joined_without_a_hole():
+    vertices, faces = ball()
+    corner = faces[0, 0]
+    twin = len(vertices)
+    ring = np.flatnonzero((faces == corner).any(axis=1))
+    first = ring[0]
+    p, q = (v for v in faces[first] if v != corner)
+    faces[first][faces[first] == corner] = twin
+    faces = np.vstack([faces, [(corner, p, twin), (twin, q, corner)]])
+    mesh = clean(np.vstack([vertices, vertices[corner] + 1e-15]), faces)
+    assert any("neighbours at no distance" in line for line in mesh.log)
+    assert topology.euler_characteristic(mesh.faces) == 2
+    assert topology.boundary_loops(mesh.faces) == []
+    assert mesh.merged[twin] == mesh.merged[corner]
+
+
+@pytest.mark.parametrize(("scale", "word"), [(1e40, "too large"), (1e-40, "too small")])
+def test_what_single_precision_cannot_hold_is_refused(scale, word):
+    vertices, faces = ball()
+    with pytest.raises(NsmError, match=word):
+        clean(scale * vertices, faces)
