@@ -41,8 +41,11 @@ def _run(config: DictConfig) -> bool:
 
 def main() -> None:
     """Entry point. Exit status 0, 2 for bad input (one line on stderr) or 130 if interrupted."""
-    if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
-        _command(COMMANDS[sys.argv[1]], sys.argv[2:])
+    words = sys.argv[1:]
+    if words and words[0] in COMMANDS:
+        _command(COMMANDS[words[0]], words[1:])
+    elif {"--help", "-h"} & set(words):
+        _command("nsm.help", [word for word in words if not word.startswith("-")])
     else:
         _tasks()
 
@@ -69,7 +72,7 @@ def _tasks() -> None:
     try:
         job()
     except (HydraException, OmegaConfBaseException) as error:
-        _say(one_line(error))
+        _say(one_line(error, [word for word in sys.argv[1:] if not word.startswith("-")]))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

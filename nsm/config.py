@@ -12,9 +12,10 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from nsm.errors import NsmError
 
@@ -182,7 +183,7 @@ def compose_config(overrides: Sequence[str] = ()) -> DictConfig:
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
             return checked(compose("config", overrides=list(overrides)))
     except (HydraException, OmegaConfBaseException) as error:
-        raise NsmError(one_line(error)) from error
+        raise NsmError(one_line(error, overrides)) from error
 
 
 def checked(config: DictConfig) -> DictConfig:
@@ -195,27 +196,56 @@ def checked(config: DictConfig) -> DictConfig:
         typed = OmegaConf.merge(OmegaConf.structured(Schema), config)
         OmegaConf.resolve(typed)
     except OmegaConfBaseException as error:
-        raise NsmError(f"setting {getattr(error, 'full_key', '')}: {one_line(error)}") from error
+        raise NsmError(_misfit(error)) from error
+    assert isinstance(typed, DictConfig)
+    missing = sorted(OmegaConf.missing_keys(typed))
+    if missing:
+        raise NsmError(f"setting {missing[0]}: missing; choose an option of its group or give it")
     for key in _POSITIVE:
         if OmegaConf.select(typed, key) < 1:
             raise NsmError(f"setting {key}: {OmegaConf.select(typed, key)} is not at least 1")
     if not 0 <= typed.data.vertex_share <= 1:
         raise NsmError(f"setting data.vertex_share: {typed.data.vertex_share} is not in [0, 1]")
-    assert isinstance(typed, DictConfig)
+    from nsm.choices import check_choices  # torch takes seconds; mistakes above need not wait
+
+    check_choices(typed)
+    if typed.phi.overrides:
+        compose_config(["task=overfit", *typed.phi.overrides])
     return typed
 
 
-def one_line(error: BaseException) -> str:
-    """An error of the configuration libraries in one line, with the nearest valid name."""
+def _misfit(error: OmegaConfBaseException) -> str:
+    """What does not fit the types, with the nearest name for a key that does not exist."""
+    key = getattr(error, "full_key", None) or ""
+    if not isinstance(error, ConfigKeyError):
+        return f"setting {key}: {one_line(error)}"
+    near = difflib.get_close_matches(key, known_keys(), n=1, cutoff=0.6)
+    hint = f"did you mean '{near[0]}'?" if near else "see nsm --help"
+    return f"setting {key}: no setting is called so; {hint}"
+
+
+def one_line(error: BaseException, overrides: Sequence[str] = ()) -> str:
+    """An error of the configuration libraries in one line, with the nearest valid name.
+
+    Args:
+        error: what was raised.
+        overrides: that it was raised for; with them the chosen options are known, and so is what
+            they take.
+    """
     text = str(error).strip()
     first = text.splitlines()[0] if text else type(error).__name__
+    if isinstance(error, OverrideParseException):
+        return (
+            f"{error.override}: {first}; quote values with signs in them, as in "
+            "'surface.path=\"a=b.obj\"'"
+        )
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
-        key = unknown.group(1)
-        near = difflib.get_close_matches(key, known_keys(), n=1, cutoff=0.5)
-        hint = f"; did you mean '{near[0]}'?" if near else "; see nsm --help"
-        return f"no setting or group is called '{key}'{hint}"
-    option = re.search(r"Could not find '([^'/]+)/([^']+)'", text)
+        return _unknown(unknown.group(1), overrides)
+    twice = re.search(r"Could not append to config. An item is already at '([^']+)'", text)
+    if twice:
+        return f"setting {twice.group(1)}: it is there already; leave out the +"
+    option = re.search(r"Could not find '([^']+)/([^'/]+)'", text)
     if option:
         group, name = option.groups()
         names = sorted(p.stem for p in (conf_folder() / group).glob("*.yaml"))
@@ -225,14 +255,41 @@ def one_line(error: BaseException) -> str:
     return first
 
 
+def _single(overrides: Sequence[str]) -> list[str]:
+    """The overrides of one job of a sweep."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    return [
+        f"{word.get_key_element()}={next(word.sweep_string_iterator())}"
+        if word.is_discrete_sweep()
+        else str(word.input_line)
+        for word in parsed
+        if not word.is_interval_sweep()
+    ]
+
+
+def _unknown(key: str, overrides: Sequence[str]) -> str:
+    """What to say of an override whose key the configuration does not have."""
+    overrides = _single(overrides)
+    given = [word for word in overrides if word.startswith(f"{key}=")]
+    if given and "." in key:
+        # taken as an addition it is checked against what the chosen options take
+        try:
+            compose_config([f"+{word}" if word in given else word for word in overrides])
+        except NsmError as error:
+            return str(error)
+        else:
+            return f"setting {key}: the chosen option leaves it out; add it with +{given[0]}"
+    near = difflib.get_close_matches(key, known_keys(), n=1, cutoff=0.6)
+    hint = f"did you mean '{near[0]}'?" if near else "see nsm --help"
+    return f"no setting or group is called '{key}'; {hint}"
+
+
 def known_keys() -> list[str]:
     """Names of all groups and settings, dotted."""
-    groups = [p.name for p in conf_folder().iterdir() if p.is_dir()]
-    keys = list(groups)
-    for file in sorted(conf_folder().rglob("*.yaml")):
-        loaded = OmegaConf.load(file)
-        if not isinstance(loaded, DictConfig):
-            continue
-        prefix = f"{file.parent.name}." if file.parent != conf_folder() else ""
-        keys += [f"{prefix}{key}" for key in map(str, loaded) if key not in ("defaults", "hydra")]
-    return sorted(set(keys))
+    from nsm.reference import groups, ungrouped
+
+    known = {setting.key for setting in ungrouped()}
+    for group in groups():
+        known.add(group.name.replace("/", "."))
+        known.update(setting.key for option in group.options for setting in option.settings)
+    return sorted(known)

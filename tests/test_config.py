@@ -1,23 +1,74 @@
 """The configuration: every file composes, and mistakes are told in one line."""
 
-import pytest
+import inspect
 
+import pytest
+import torch
+
+from nsm.choices import NAMED, TASK_CHOICES
 from nsm.config import compose_config, conf_folder, known_keys
 from nsm.errors import NsmError
+from nsm.pipeline import TASKS
 from nsm.surfaces import catalogue_names
 
 FILES = sorted(
-    (file.parent.name, file.stem)
+    (str(file.parent.relative_to(conf_folder())), file.stem)
     for file in conf_folder().rglob("*.yaml")
     if file.parent != conf_folder()
 )
+# what an option of these groups means depends on the task
+FOR_TASK = {
+    "energy": lambda name: "overfit" if name == "overfit" else "param",
+    "constraints": lambda name: "param" if name == "param" else "pair_map",
+    "lambda": lambda name: {"param": "param"}.get(
+        name, "pair_map" if "pair" in name else "overfit"
+    ),
+    "experiment": lambda name: "pair_map" if name == "paper_pair" else "overfit",
+}
 
 
 @pytest.mark.parametrize(("group", "name"), FILES)
 def test_every_file_composes(group, name):
-    config = compose_config([f"{group}={name}"])
-    if group in config:
-        assert config[group] is not None
+    task = FOR_TASK.get(group, lambda name: "overfit")(name)
+    words = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
+    config = compose_config(words)
+    assert config.domain == ("square" if name == "square" else "disc")
+    if group in NAMED:
+        assert config[group].name in NAMED[group]
+
+
+def test_every_known_choice_is_an_option():
+    """Nothing that the code offers is out of reach of GROUP=OPTION."""
+    for group, known in NAMED.items():
+        options = [name for g, name in FILES if g == group]
+        assert {compose_config([f"{group}={o}"])[group].name for o in options} == set(known)
+    assert set(TASK_CHOICES) == set(TASKS) == {name for g, name in FILES if g == "task"}
+
+
+def test_optimizers_take_what_torch_takes():
+    assert set(NAMED["optimizer"]["sgd"]) == {
+        *inspect.signature(torch.optim.SGD).parameters,
+        "encoding_lr",
+    } - {"params"}
+
+
+def test_the_check_leaves_no_trace_in_the_random_numbers():
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    compose_config(["map=residual"])
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_groups_can_be_changed_apart():
+    config = compose_config(["task=pair_map", "data=paper", "lambda=paper_pair"])
+    assert (config.data.batch_size, config.data.pool) == (4000, 500_000)
+    assert config.constraints.boundary == "exact"
+    assert config.constraints.lambda_seam == 0
+    config = compose_config(["task=pair_map", "data=paper", "sampler=fresh", "domain=square"])
+    assert (config.data.batch_size, config.data.pool, config.domain) == (4000, None, "square")
+    config = compose_config(["task=pair_map", "constraints=paper_pair", "lambda=pair"])
+    assert (config.constraints.boundary, config.constraints.lambda_seam) == ("penalty", 1e3)
 
 
 def test_the_surface_group_is_the_catalogue():
@@ -42,25 +93,71 @@ def test_paper_settings_are_those_of_the_paper():
 
 
 @pytest.mark.parametrize(
-    ("override", "expected"),
+    ("words", "expected"),
     [
-        ("trainer.max_step=10", "trainer.max_steps"),
-        ("activaton=silu", "activation"),
-        ("activation=sillu", "silu"),
-        ("surface=bunnny", "bunny"),
+        ("trainer.max_step=10", "'trainer.max_steps'"),
+        ("+trainer.max_step=10", "'trainer.max_steps'"),
+        ("activaton=silu", "'activation'"),
+        ("activation=sillu", "'silu'"),
+        ("surface=bunnny", "'bunny'"),
+        ("domain=squre", "'square'"),
+        ("lambda=positons", "'positions'"),
         ("trainer.max_steps=many", "trainer.max_steps"),
+        ("trainer.accelerator=gppu", "'gpu'"),
         ("data.batch_size=0", "data.batch_size"),
         ("data.vertex_share=2", "data.vertex_share"),
-        ("trainer.max_steps=[", "["),
+        ("trainer.max_steps=[", "trainer.max_steps=["),
+        ("map.block=pots", "'post'"),
+        ("surface.parameterization=slimm", "'slim'"),
+        ("phi.overrides=['map.widht=3']", "'map.width'"),
+        # inside the groups whose keys depend on the choice
+        ("activation.bta=3", "'beta'"),
+        ("+activation.bta=3", "'beta'"),
+        ("activation=relu +activation.beta=3", "takes no such setting"),
+        ("activation.beta=soft", "not a number"),
+        ("encoding.feature=4", "'features'"),
+        ("encoding.features=2.5", "not a whole number"),
+        ("encoding.resolutions=[16,many]", "each item a whole number"),
+        ("encoding.degree=7", "degree 2 or 3"),
+        ("+optimizer.weight_decy=0.1", "'weight_decay'"),
+        ("optimizer=rmsprop optimizer.momentun=0.1", "'momentum'"),
+        ("optimizer.momentum=0.1", "optimizer=adam takes no such setting"),
+        ("optimizer.weight_decay=0.1", "+optimizer.weight_decay=0.1"),
+        ("optimizer.lr=fast", "not a number"),
+        ("optimizer.betas=[2,3]", "setting optimizer: "),
+        ("scheduler=sgdr scheduler.periode=9", "'period'"),
+        ("scheduler=sgdr scheduler.period=0", "positive"),
+        ("energy.lambda_norml=1", "'lambda_normal'"),
+        ("energy=conformal", "task=overfit takes no such setting"),
+        ("constraints=pair", "task=overfit has none"),
+        ("task=param +energy.weights.arpa=1", "'area'"),
+        ("task=param energy.weights.symmetric_dirichlet=[]", "not a number"),
+        ("task=param constraints.bondary=fixed", "'boundary'"),
+        ("task=param constraints.boundary=fixd", "'fixed'"),
+        ("task=pair_map constraints.ramp=3", "constraints.ramp"),
+        ("task=pair_map constraints.multiplier_every=often", "not a whole number"),
+        ("task=pair_map lambda=param", "constraints.lambda_boundary"),
+        ("+optimizer.lr=1", "leave out the +"),
     ],
 )
-def test_mistakes_are_one_line_that_helps(override, expected):
+def test_mistakes_are_one_line_that_helps(words, expected):
     with pytest.raises(NsmError) as error:
-        compose_config([override])
+        compose_config(words.split())
     assert "\n" not in str(error.value)
     assert expected in str(error.value)
 
 
+def test_misspelt_keys_of_ones_own_files_are_told(tmp_path, here):
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    file = tmp_path / "conf" / "experiment" / "mine.yaml"
+    file.write_text("# @package _global_\ntrainer:\n  max_stepz: 3\n")
+    result = here("--config-dir=conf", "experiment=mine")
+    assert result.returncode == 2
+    assert "'trainer.max_steps'" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
 def test_known_keys_are_dotted():
-    assert "trainer.max_steps" in known_keys()
-    assert "activation" in known_keys()
+    assert {"trainer.max_steps", "activation", "domain", "constraints.lambda_seam"} <= set(
+        known_keys()
+    )

@@ -17,7 +17,40 @@ OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
     "rmsprop": torch.optim.RMSprop,
     "sgd": torch.optim.SGD,
 }
-SCHEDULERS = ("constant", "cosine", "sgdr")
+Factor = Callable[[float], float]  # of the step: share of the full learning rate
+
+
+def _constant(max_steps: int) -> Factor:
+    return lambda step: 1.0
+
+
+def _cosine(max_steps: int, final: float = 0.0) -> Factor:
+    return lambda step: _wave(min(1.0, step / max(1, max_steps)), final)
+
+
+def _sgdr(max_steps: int, period: float, period_factor: float = 1.0, final: float = 0.0) -> Factor:
+    if period <= 0 or period_factor <= 0:
+        raise ValueError("scheduler.period and scheduler.period_factor must be positive")
+
+    def factor(step: float) -> float:
+        length = float(period)
+        while step >= length:
+            step -= length
+            length *= period_factor
+        return _wave(step / length, final)
+
+    return factor
+
+
+def _wave(share: float, final: float) -> float:
+    return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+SCHEDULERS: dict[str, Callable[..., Factor]] = {
+    "constant": _constant,
+    "cosine": _cosine,
+    "sgdr": _sgdr,
+}
 
 
 def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
@@ -55,29 +88,17 @@ def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: i
     (Loshchilov and Hutter, ICLR 2017). All rise linearly over the first ``warmup`` steps.
 
     Raises:
-        ValueError: the schedule is not known.
+        ValueError: the schedule is not known or does not take a parameter.
     """
-    name, warmup = settings["name"], settings.get("warmup", 0)
-    final = settings.get("final", 0.0)
+    rest = dict(settings)
+    name, warmup = rest.pop("name"), rest.pop("warmup", 0)
     if name not in SCHEDULERS:
         raise ValueError(f"scheduler {name!r} is not one of {', '.join(SCHEDULERS)}")
-
-    def wave(share: float) -> float:
-        return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * share))
-
-    def factor(step: int) -> float:
-        rise = min(1.0, (step + 1) / (warmup + 1))
-        if name == "constant":
-            return rise
-        if name == "cosine":
-            return rise * wave(min(1.0, step / max(1, max_steps)))
-        start, period = 0.0, float(settings["period"])
-        while step >= start + period:
-            start += period
-            period *= settings.get("period_factor", 1.0)
-        return rise * wave((step - start) / period)
-
-    return LambdaLR(optimizer, factor)
+    try:
+        factor = SCHEDULERS[name](max_steps, **rest)
+    except TypeError as error:
+        raise ValueError(f"scheduler {name!r}: {error}") from error
+    return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / (warmup + 1)) * factor(step))
 
 
 def configure(module: nn.Module, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,82 @@
+"""The help screen and completion: all that conf/ offers, said to people and shells."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from nsm.config import compose_config, conf_folder
+from nsm.reference import groups, ungrouped
+
+FILES = [file for file in sorted(conf_folder().rglob("*.yaml")) if file.parent != conf_folder()]
+
+
+def test_every_group_option_and_setting_has_a_remark():
+    for group in groups():
+        assert group.remark, group.name
+        for option in group.options:
+            assert option.remark, (group.name, option.name)
+            for setting in option.settings:
+                assert setting.remark, setting
+    assert all(setting.remark for setting in ungrouped())
+
+
+def test_it_reads_what_yaml_reads():
+    """Beside a whole YAML parser: no key is lost, and values are those of the composition."""
+
+    def leaves(node, prefix=""):
+        for key, value in node.items():
+            if isinstance(value, dict):
+                yield from leaves(value, f"{prefix}{key}.")
+            else:
+                yield f"{prefix}{key}"
+
+    expected = leaves(yaml.safe_load((conf_folder() / "config.yaml").read_text()))
+    own = {key for key in expected if not key.startswith(("hydra", "defaults"))}
+    assert {setting.key for setting in ungrouped()} == own
+    trainer = next(group for group in groups() if group.name == "trainer").options[0]
+    config = compose_config().trainer
+    assert {s.key for s in trainer.settings} == {f"trainer.{key}" for key in config}
+    for setting in trainer.settings:
+        assert yaml.safe_load(setting.value) == config[setting.key.split(".")[1]]
+
+
+def test_help_names_every_option(here):
+    result = here("--help")
+    assert result.returncode == 0
+    for file in FILES:
+        assert file.stem in result.stdout
+    assert "  * softplus " in result.stdout
+    assert "The published softplus, β = 1." in result.stdout
+
+
+def test_help_on_a_group_tells_its_settings(here):
+    result = here("--help", "encoding")
+    assert "encoding.resolutions=[16, 64, 256]" in result.stdout
+    assert "cells a side" in result.stdout
+    assert "trainer" not in result.stdout
+    assert "'encoding'" in here("--help", "encodin").stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("nsm activation=s", "activation=softplus"),
+        ("nsm doma", "domain="),
+        ("nsm trainer.max_", "trainer.max_steps="),
+        ("nsm optimizer=rmsprop optimizer.mo", "optimizer.momentum="),
+    ],
+)
+def test_shells_are_told_what_may_follow(here, monkeypatch, line, expected):
+    monkeypatch.setenv("COMP_LINE", line)
+    assert expected in here("-sc", "query=bash").stdout.split()
+
+
+def test_help_does_not_wait_for_torch():
+    code = "import sys; sys.argv = ['nsm', '--help']; from nsm.cli import main; main(); "
+    code += "assert 'torch' not in sys.modules"
+    environment = {**os.environ, "COLUMNS": "100"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
+    assert result.returncode == 0, result.stderr
