@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from nsm.maps.activations import Activation
 from nsm.maps.encodings import ENCODINGS, Encoding
-
-
-def _push_linear(layer: nn.Linear, s: Tensor) -> Tensor:
-    """One matrix product for value and tangents; the bias belongs to the value alone."""
-    out = s @ layer.weight.T
-    return torch.cat([out[:1] + layer.bias, out[1:]])
+from nsm.maps.trunk import Trunk
 
 
 class PostActivationBlock(nn.Module):
@@ -29,10 +24,6 @@ class PostActivationBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.activation(x + self.second(self.activation(self.first(x))))
 
-    def push(self, s: Tensor) -> Tensor:
-        inner = self.activation.push(_push_linear(self.first, s))
-        return self.activation.push(s + _push_linear(self.second, inner))
-
 
 class PreActivationBlock(nn.Module):
     """x + L₂ act(L₁ act(x)), with L₂ zero at the start, so that the block begins as identity."""
@@ -45,10 +36,6 @@ class PreActivationBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(self.activation(self.first(self.activation(x))))
 
-    def push(self, s: Tensor) -> Tensor:
-        inner = self.activation.push(_push_linear(self.first, self.activation.push(s)))
-        return s + _push_linear(self.second, inner)
-
 
 class DenseBlock(nn.Module):
     """act(L x): one layer of a plain multi-layer perceptron."""
@@ -60,9 +47,6 @@ class DenseBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.activation(self.linear(x))
 
-    def push(self, s: Tensor) -> Tensor:
-        return self.activation.push(_push_linear(self.linear, s))
-
 
 Block = DenseBlock | PostActivationBlock | PreActivationBlock
 BLOCKS: dict[str, type[Block]] = {
@@ -70,6 +54,8 @@ BLOCKS: dict[str, type[Block]] = {
     "post": PostActivationBlock,
     "pre": PreActivationBlock,
 }
+# what every second layer adds (see :class:`nsm.maps.trunk.Trunk`)
+SKIPS = {"plain": None, "post": "post", "pre": "pre"}
 INITIALISATIONS = ("xavier", "kaiming", "siren")
 
 
@@ -121,6 +107,7 @@ class NeuralMap(nn.Module):
         self.input = nn.Linear(self.encoding.out_dim, width)
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
         self.output = nn.Linear(width, out_dim)
+        self._layers = [m for m in self.modules() if isinstance(m, nn.Linear)]
         self._initialise(initialisation)
 
     def _initialise(self, how: str) -> None:
@@ -159,14 +146,13 @@ class NeuralMap(nn.Module):
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
-        s = _push_linear(self.input, self.encoding.value_and_jacobian_stack(x))
-        if self._opens_with_activation:
-            s = self.activation.push(s)
-        for block in self.blocks:
-            s = cast(Block, block).push(s)
-        if not self._opens_with_activation:
-            s = self.activation.push(s)
-        s = _push_linear(self.output, s)
+        s = Trunk.apply(
+            self.encoding.value_and_jacobian_stack(x),
+            self.activation,
+            SKIPS[self.config["block"]],
+            torch.is_grad_enabled(),
+            *(p for layer in self._layers for p in (layer.weight, layer.bias)),
+        )
         return s[0], s[1:].permute(1, 2, 0)
 
 

@@ -41,7 +41,8 @@ def test_agrees_with_jacfwd(block, activation, encoding):
     expected = torch.func.vmap(torch.func.jacfwd(lambda p: net(p[None])[0]))(x)
     scale = expected.abs().max().clamp(min=1)
     assert jacobian.shape == (32, 3, 2)
-    torch.testing.assert_close(value, net(x), rtol=0, atol=1e-10)
+    # rounding grows as the map is steep: with sin(30 z) in every layer by a factor of 1e5
+    torch.testing.assert_close(value, net(x), rtol=0, atol=1e-14 * scale.item() + 1e-10)
     assert ((jacobian - expected).abs().max() / scale) < 1e-10
 
 
