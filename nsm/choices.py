@@ -126,8 +126,8 @@ TASK_CHOICES: dict[str, TaskChoice] = {
 # group -> name -> what it takes
 NAMED: dict[str, dict[str, Parameters]] = {
     "activation": {
-        name: {key: Parameter(float) for key in defaults}
-        for name, (_, defaults) in ACTIVATIONS.items()
+        name: {key: Parameter(float) for key in formulas.defaults}
+        for name, formulas in ACTIVATIONS.items()
     },
     "encoding": {name: parameters(cls, skip=1) for name, cls in ENCODINGS.items()},
     "optimizer": {
