@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 
 class Identity(nn.Module):
@@ -56,27 +58,101 @@ class RandomFourierFeatures(nn.Module):
         return torch.cat([value[None], tangents])
 
 
-def _bspline(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Weights (N, degree + 1) of the uniform B-spline at offset t in [0, 1), and d/dt."""
+def _bspline(t: Tensor, degree: int) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """The degree + 1 weights of the uniform B-spline at offset t in [0, 1), d/dt, and d²/dt²."""
+    s = 1 - t
     if degree == 2:
-        s = 1 - t
-        weights = torch.stack([0.5 * s * s, 0.5 + t * s, 0.5 * t * t], dim=-1)
-        slopes = torch.stack([-s, 1 - 2 * t, t], dim=-1)
-    else:
-        s = 1 - t
-        weights = torch.stack(
-            [
-                s**3 / 6,
-                (3 * t**3 - 6 * t**2 + 4) / 6,
-                (3 * s**3 - 6 * s**2 + 4) / 6,
-                t**3 / 6,
-            ],
-            dim=-1,
+        one = torch.ones_like(t)
+        weights = [0.5 * s * s, 0.5 + t * s, 0.5 * t * t]
+        return weights, [-s, 1 - 2 * t, t], [one, -2 * one, one]
+    weights = [
+        s**3 / 6,
+        (3 * t**3 - 6 * t**2 + 4) / 6,
+        (3 * s**3 - 6 * s**2 + 4) / 6,
+        t**3 / 6,
+    ]
+    slopes = [-0.5 * s**2, 1.5 * t**2 - 2 * t, 2 * s - 1.5 * s**2, 0.5 * t**2]
+    return weights, slopes, [s, 3 * t - 2, 3 * s - 2, t]
+
+
+class _Blend(torch.autograd.Function):
+    """Features of all levels, blended for value and tangents, with the backward pass written out.
+
+    Plain autograd goes through tensors of all taps of all points, one small operation for each
+    step of the formulas, and sorts indices for each table.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        taps: Tensor,
+        derivatives: tuple[Tensor, Tensor, Tensor],
+        record: bool,
+        *tables: Tensor,
+    ) -> Tensor:
+        """Blended features of points x (N, 2): (3, N, L · F).
+
+        Args:
+            taps: (L, k², N) rows of the tables that each point sees.
+            derivatives: (L, 2, k, N) weights along either axis, and their first and second
+                derivatives.
+            record: whether there will be a backward pass.
+            tables: one for each of L levels, (rows, F).
+        """
+        turned = record and ctx.needs_input_grad[0]
+        levels, _, _, count = derivatives[0].shape
+        # value, ∂u, ∂v, and for the gradient by x: ∂uu, ∂uv, ∂vv
+        orders = [(0, 0), (1, 0), (0, 1), *([(2, 0), (1, 1), (0, 2)] if turned else [])]
+        blend = torch.stack(
+            [derivatives[i][:, 0, :, None] * derivatives[j][:, 1, None] for i, j in orders], dim=1
+        ).view(levels, len(orders), -1, count)
+        rows = taps.transpose(1, 2)[:, None].expand(-1, len(orders), -1, -1)
+        features = [
+            nn.functional.embedding_bag(
+                row.reshape(-1, row.shape[-1]),
+                table,
+                mode="sum",
+                per_sample_weights=weight.transpose(1, 2).reshape(-1, weight.shape[1]),
+            ).view(len(orders), count, -1)
+            for row, weight, table in zip(rows, blend, tables, strict=True)
+        ]
+        out = torch.cat([f[:3] for f in features], dim=-1)
+        trained = record and any(ctx.needs_input_grad[4:])
+        ctx.save_for_backward(
+            torch.cat([f[1:] for f in features], dim=-1) if turned else None,
+            *((taps, blend[:, :3]) if trained else (None, None)),
         )
-        slopes = torch.stack(
-            [-0.5 * s**2, 1.5 * t**2 - 2 * t, 2 * s - 1.5 * s**2, 0.5 * t**2], dim=-1
-        )
-    return weights, slopes
+        ctx.shapes = [table.shape for table in tables]
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        derivatives, taps, blend = ctx.saved_tensors
+        by_x = None
+        if derivatives is not None:
+            u, v, uu, uv, vv = derivatives
+            g, gu, gv = gradient
+            by_x = torch.stack(
+                [(g * u + gu * uu + gv * uv).sum(dim=1), (g * v + gu * uv + gv * vv).sum(dim=1)],
+                dim=1,
+            )
+        by_table: list[Tensor | None] = [None] * len(ctx.shapes)
+        if blend is not None:
+            # points innermost: long rows for the processor
+            g = gradient.transpose(1, 2).contiguous()
+            g = g.view(3, len(ctx.shapes), 1, -1, gradient.shape[1])
+            shares = blend[:, 0, :, None] * g[0]
+            for plane in (1, 2):
+                shares.addcmul_(blend[:, plane, :, None], g[plane])
+            width = shares.shape[2]
+            places = taps[:, :, None] * width + torch.arange(width, device=taps.device)[:, None]
+            for level, shape in enumerate(ctx.shapes):
+                flat = gradient.new_zeros(shape).view(-1)
+                flat.scatter_add_(0, places[level].flatten(), shares[level].flatten())
+                by_table[level] = flat.view(shape)
+        return (by_x, None, None, None, *by_table)
 
 
 class SplineGrid(nn.Module):
@@ -113,34 +189,45 @@ class SplineGrid(nn.Module):
         )
         self.out_dim = in_dim + features * len(self.resolutions)
 
+    def _seen(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
+        """Rows (L, k², N) of the tables that points (N, 2) see, and the weights (L, 2, N) of the
+        k rows along each axis, with their first and second derivatives by x."""
+        size = torch.tensor(self.resolutions, device=x.device)[:, None, None]
+        per_unit = size.to(x.dtype) / (2 * self.extent)
+        z = (x.t() + self.extent) * per_unit
+        cell = z.detach().floor().clamp(min=0).minimum(size.to(x.dtype) - 1)
+        free = z - cell
+        offset = free.clamp(0, 1)
+        within = (offset == free) * per_unit  # beyond the rim nothing changes
+        weights, slopes, bends = _bspline(offset, self.degree)
+        step = torch.arange(self.degree + 1, device=x.device)[:, None]
+        corner = cell.long()
+        across = (corner[:, 0, None] + step) * (size + self.degree)
+        rows = across[:, :, None] + (corner[:, 1, None] + step)[:, None]
+        scaled = [[w * within for w in slopes], [w * within * within for w in bends]]
+        return rows.flatten(1, 2), [weights, *scaled]
+
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""
-        k = self.degree + 1
-        taps = torch.arange(k, device=x.device)
+        with torch.no_grad():
+            rows, orders = self._seen(x)
+            value, first, second = (torch.stack(w, dim=2) for w in orders)
         unit = torch.eye(2, dtype=x.dtype, device=x.device)[:, None, :].expand(-1, x.shape[0], -1)
-        parts = [torch.cat([x[None], unit])]
-        for resolution, table in zip(self.resolutions, self.tables, strict=True):
-            per_unit = resolution / (2 * self.extent)
-            z = (x + self.extent) * per_unit
-            cell = z.detach().floor().clamp(0, resolution - 1)
-            weights, slopes = _bspline((z - cell).clamp(0, 1), self.degree)
-            slopes = slopes * per_unit
-            index = cell.long()[:, :, None] + taps
-            flat = index[:, 0, :, None] * (resolution + self.degree) + index[:, 1, None, :]
-            gathered = nn.functional.embedding(flat.reshape(len(x), k * k), table)
-            blend = torch.stack(
-                [
-                    weights[:, 0, :, None] * weights[:, 1, None, :],
-                    slopes[:, 0, :, None] * weights[:, 1, None, :],
-                    weights[:, 0, :, None] * slopes[:, 1, None, :],
-                ],
-                dim=1,
-            ).reshape(len(x), 3, k * k)
-            parts.append(torch.bmm(blend, gathered).transpose(0, 1))
-        return torch.cat(parts, dim=-1)
+        blended = _Blend.apply(
+            x, rows, (value, first, second), torch.is_grad_enabled(), *self.tables
+        )
+        return torch.cat([torch.cat([x[None], unit]), blended], dim=-1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.value_and_jacobian_stack(x)[0]
+        rows, (weights, _, _) = self._seen(x)
+        both = torch.stack(weights, dim=2)
+        blend = (both[:, 0, :, None] * both[:, 1, None]).flatten(1, 2)
+        parts = [x]
+        for row, weight, table in zip(rows, blend, self.tables, strict=True):
+            # not an embedding, whose backward pass sorts
+            seen = table.index_select(0, row.flatten()).view(*row.shape, self.features)
+            parts.append((weight[:, :, None] * seen).sum(dim=0))
+        return torch.cat(parts, dim=-1)
 
 
 Encoding = Identity | RandomFourierFeatures | SplineGrid

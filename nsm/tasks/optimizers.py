@@ -17,6 +17,8 @@ OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
     "rmsprop": torch.optim.RMSprop,
     "sgd": torch.optim.SGD,
 }
+# those that torch offers as one operation for all parameters
+_FUSED = ("adam", "adamw", "sgd")
 Factor = Callable[[float], float]  # of the step: share of the full learning rate
 
 
@@ -74,6 +76,8 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
     groups: list[dict[str, Any]] = [{"params": others}]
     if grids:
         groups.append({"params": grids, "lr": encoding_lr or rest["lr"]})
+    if name in _FUSED and not rest.get("foreach"):
+        rest.setdefault("fused", True)
     try:
         return OPTIMIZERS[name](groups, **rest)
     except TypeError as error:

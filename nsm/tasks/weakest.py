@@ -10,7 +10,9 @@ from torch import Tensor, nn
 from nsm.energies import unfold
 
 _COUNT = 256
-_EVERY = 25  # steps between two looks at all triangles
+_EVERY = 25  # steps between two looks at the triangles
+# triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
+_LOOK = 65_536
 
 
 class Weakest(nn.Module):
@@ -43,12 +45,28 @@ class Weakest(nn.Module):
         """Mean ``unfold`` over the weakest triangles under h: a scalar."""
         if step % _EVERY == 0:
             with torch.no_grad():
-                relative = _double_areas(h(self.uv)[self.faces]) / self.area
-                self.chosen = relative.topk(len(self.chosen), largest=False).indices
+                self._look(h, step // _EVERY)
         corners = self.uv[self.faces[self.chosen]]
         image = h(corners.reshape(-1, 2)).reshape(-1, 3, 2)
         relative = _double_areas(image) / self.area[self.chosen]
         return unfold(relative).mean()
+
+    def _look(self, h: Callable[[Tensor], Tensor], number: int) -> None:
+        """Choose anew, among all triangles or, of a large mesh, a part of them and the last."""
+        faces, area, index = self.faces, self.area, None
+        if len(faces) <= _LOOK:
+            image = h(self.uv)
+        else:
+            looks = -(-len(faces) // _LOOK)
+            turn = number % looks  # neighbours together share most of their vertices
+            ends = (len(faces) * turn // looks, len(faces) * (turn + 1) // looks)
+            part = torch.arange(*ends, device=faces.device)
+            index = torch.cat([part, self.chosen]).unique()
+            rows, faces = faces[index].unique(return_inverse=True)
+            image, area = h(self.uv[rows]), area[index]
+        relative = _double_areas(image[faces]) / area
+        weakest = relative.topk(len(self.chosen), largest=False).indices
+        self.chosen = weakest if index is None else index[weakest]
 
 
 def _double_areas(corners: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd.graph import saved_tensors_hooks
 
-from nsm.maps import ACTIVATIONS, BLOCKS, build_map, trunk
+from nsm.maps import ACTIVATIONS, BLOCKS, SplineGrid, build_map, trunk
 
 
 def made(activation: str, block: str, depth: int = 2, width: int = 5) -> torch.nn.Module:
@@ -130,3 +130,29 @@ def test_no_points_and_no_hidden_layers():
 def test_negative_parameters_are_refused():
     with pytest.raises(ValueError, match="activation.beta"):
         build_map({"activation": {"name": "softplus", "beta": -1.0}})
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_spline_grid_by_finite_differences(degree):
+    torch.manual_seed(0)
+    grid = SplineGrid(2, resolutions=[3, 5], features=2, degree=degree, extent=0.9).double()
+    x = points(6)  # some beyond the rim, where the grid goes on as a constant
+    assert (x.abs() > 0.9).any()
+
+    def f(x, *tables):
+        return grid.value_and_jacobian_stack(x)
+
+    assert torch.autograd.gradcheck(f, (x.requires_grad_(), *grid.tables))
+    tangents = torch.func.vmap(torch.func.jacfwd(lambda p: grid(p[None])[0]))(x.detach())
+    stack = grid.value_and_jacobian_stack(x)
+    torch.testing.assert_close(stack[0], grid(x))
+    torch.testing.assert_close(stack[1:], tangents.permute(2, 0, 1))
+
+
+def test_frozen_spline_grid_keeps_derivatives_alone():
+    grid = SplineGrid(2, resolutions=[8, 16], features=4).requires_grad_(False)
+    kept = []
+    x = torch.rand(10, 2).requires_grad_()
+    with saved_tensors_hooks(lambda t: kept.append(t.numel()) or t, lambda t: t):
+        grid.value_and_jacobian_stack(x)
+    assert sum(kept) == 5 * 10 * 8

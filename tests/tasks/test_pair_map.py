@@ -7,6 +7,7 @@ import torch
 from nsm.maps import build_analytic
 from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks import CollectionMap, PairMap
+from nsm.tasks import weakest as weakest_module
 from nsm.tasks.start import landmark_rotation, least_distorting_rotation
 from nsm.tasks.weakest import Weakest
 
@@ -264,6 +265,25 @@ def test_a_collection_meets_its_landmarks_on_every_surface():
     targets = torch.tensor([[[0.3, 0.1]], [[0.1, 0.1]], [[0.2, 0.2]]])
     module = optimise(collection(["plane", "saddle", "sphere_cap"], points, targets), 500)
     assert (module(points) - targets).norm(dim=2).max() < 0.01
+
+
+def test_a_large_mesh_is_gone_through_in_parts(monkeypatch):
+    def folding(x):
+        asked.append(len(x))
+        return torch.stack([x[:, 0] - 0.9 * torch.sin(3 * x[:, 0]), x[:, 1]], dim=1)
+
+    asked: list[int] = []
+    uv, faces = ring_mesh(24)
+    mesh = torch.as_tensor(uv, dtype=torch.float32), torch.as_tensor(faces)
+    whole, parts = Weakest(*mesh), Weakest(*mesh)
+    whole(folding, 0)
+    monkeypatch.setattr(weakest_module, "_LOOK", 600)
+    asked.clear()
+    for step in range(0, 25 * 6, 25):  # once through all
+        parts(folding, step)
+    assert max(asked) < len(uv) / 1.5
+    folds = [w(folding, 1) for w in (whole, parts)]
+    torch.testing.assert_close(*folds)
 
 
 def test_the_weakest_triangles_are_those_that_fold():
