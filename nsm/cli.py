@@ -18,7 +18,7 @@ from nsm.errors import NsmError
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
 # input. Imported only when called for.
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {"report": "nsm.commands.report"}
 
 
 def _run(config: DictConfig) -> bool:

@@ -94,3 +94,16 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
         f"cycle error {cycle[0]:.2g} % of the diagonal in the mean, {cycle[1]:.2g} % at most"
     )
     return table
+
+
+# figure -> label, unit, of all tasks
+FIGURES: dict[str, tuple[str, str]] = {
+    **_PAIR_ROWS,
+    **_ROWS,
+    "area_median": ("area, median", "0 at best"),
+    "boundary_self_intersections": ("overlaps of the boundary", ""),
+    "cycle_error_mean_percent": ("cycle error, mean", "% of diagonal"),
+    "cycle_error_max_percent": ("cycle error, largest", "% of diagonal"),
+    "steps": ("steps", ""),
+    "seconds": ("time", "s"),
+}

@@ -13,6 +13,23 @@ def subdivide(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return fine, np.asarray(fine_faces, dtype=np.int64)
 
 
+def decimate(
+    vertices: np.ndarray, faces: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Collapse the shortest edges of a mesh (V, 3), (F, 3) until about ``count`` faces are left.
+
+    Returns:
+        the old index (W,) of each vertex, which stays in its place; the new faces (G, 3), and of
+        each the old face (G,) that it came from.
+    """
+    import igl
+
+    _, coarse, birth, kept = igl.decimate(
+        np.asfortranarray(vertices, dtype=np.float64), np.asfortranarray(faces, np.int32), count
+    )
+    return np.asarray(kept), np.asarray(coarse, dtype=np.int64), np.asarray(birth)
+
+
 def point_mesh_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Distances (N,) from points (N, 3) to a mesh; infinite where either is not finite."""
     import igl

@@ -1,0 +1,1 @@
+"""Commands beside the tasks: ``nsm WORD ...``, each a module with ``main(words)``."""

@@ -1,0 +1,204 @@
+"""What the report shows, as plain words and numbers for the page's script."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from nsm.errors import NsmError
+from nsm.results.report.curves import read_curves
+from nsm.results.report.pictures import read_pictures
+from nsm.results.report.runs import Incomplete, Run
+from nsm.results.report.shapes import Distortion, Shape, read_shapes
+from nsm.results.tables import FIGURES
+
+_BINS = 60
+_HISTOGRAMS = ("symmetric dirichlet", "singular value ratio", "area")
+_LABEL_SETTINGS = 3  # a run is called by at most so many of the settings that differ
+_HIGHER_IS_BETTER = ("covered_percent",)
+_ZERO_IS_BEST = ("normal_variation_excess_degrees",)
+_NEITHER = ("steps",)
+
+
+class _Arrays:
+    """Arrays of the page, each of which is stored once however many shapes use it."""
+
+    def __init__(self) -> None:
+        self.stored: list[dict[str, str]] = []
+        self._known: dict[bytes, int] = {}
+
+    def add(self, array: np.ndarray) -> int:
+        if np.issubdtype(array.dtype, np.integer):
+            small = array.size == 0 or int(array.max()) < 2**16
+            packed, kind = array.astype("<u2" if small else "<u4"), "u2" if small else "u4"
+        else:
+            packed, kind = array.astype("<f4"), "f4"
+        data = np.ascontiguousarray(packed).tobytes()
+        key = hashlib.sha256(kind.encode() + data).digest()
+        if key not in self._known:
+            self._known[key] = len(self.stored)
+            self.stored.append({"type": kind, "data": base64.b64encode(data).decode()})
+        return self._known[key]
+
+
+def content(title: str, runs: Sequence[Run], incomplete: Sequence[Incomplete]) -> dict[str, Any]:
+    """Everything on the page; what of a run cannot be read is listed beside incomplete runs."""
+    arrays = _Arrays()
+    aside = [{"name": item.name, "reason": item.reason} for item in incomplete]
+    tasks = []
+    for task in sorted({run.task for run in runs}):
+        of_task = [run for run in runs if run.task == task]
+        tasks.append(_task(task, of_task, arrays, aside))
+    return {"title": title, "tasks": tasks, "incomplete": aside, "arrays": arrays.stored}
+
+
+def _task(
+    task: str, runs: Sequence[Run], arrays: _Arrays, aside: list[dict[str, str]]
+) -> dict[str, Any]:
+    differing = _differing(runs)
+    labels = _labels(runs, differing)
+    shown = []
+    distortions: list[Distortion | None] = []
+    for run, label in zip(runs, labels, strict=True):
+        curves, remarks = read_curves(run.folder)
+        pictures, more = read_pictures(run.folder)
+        remarks += more
+        shapes: list[Shape] = []
+        distortion = None
+        try:
+            shapes, distortion = read_shapes(task, run.folder)
+        except NsmError as error:
+            remarks.append(f"no 3D view and no histogram: {error}")
+        distortions.append(distortion)
+        aside += [{"name": run.name, "reason": remark} for remark in remarks]
+        shown.append(
+            {
+                "name": run.name,
+                "label": label,
+                "settings": {key: _word(value) for key, value in run.settings.items()},
+                "figures": run.figures,
+                "curves": {tag: curve._asdict() for tag, curve in curves.items()},
+                "pictures": pictures,
+                "shapes": [_packed(shape, arrays) for shape in shapes],
+            }
+        )
+    return {
+        "name": task,
+        "differing": differing,
+        "figures": _described({key for run in runs for key in run.figures}),
+        "histograms": _histograms(distortions),
+        "runs": shown,
+    }
+
+
+def _differing(runs: Sequence[Run]) -> list[str]:
+    """Settings that are not the same in all runs."""
+    keys = list(dict.fromkeys(key for run in runs for key in run.settings))
+    missing = object()
+
+    def values(key: str) -> set[str]:
+        found = [run.settings.get(key, missing) for run in runs]
+        return {"" if value is missing else f"={_word(value)}" for value in found}
+
+    return [key for key in keys if len(values(key)) > 1]
+
+
+def _labels(runs: Sequence[Run], differing: Sequence[str]) -> list[str]:
+    """A short name for each run: the settings that differ, or its path where they do not tell."""
+    labels = []
+    for run in runs:
+        own = [key for key in differing if run.settings.get(key) is not None]
+        # the choice of a group says more than the parameters that come with it
+        own.sort(key=lambda key: not key.endswith(".name"))
+        words = [
+            f"{key.removesuffix('.name')}={_brief(run.settings[key])}"
+            for key in own[:_LABEL_SETTINGS]
+        ]
+        labels.append(", ".join(words))
+    if len(set(labels)) < len(labels) or not all(labels):
+        return [run.name for run in runs]
+    return labels
+
+
+def _brief(value: Any) -> str:
+    """A setting within a name: of a path the last part."""
+    return str(_word(value)).rsplit("/", 1)[-1][:40]
+
+
+def _word(value: Any) -> str | float | None:
+    """A setting as it is shown: numbers as they are, all else as text."""
+    if value is None or (isinstance(value, (int, float)) and not isinstance(value, bool)):
+        finite = value is None or abs(value) < float("inf")
+        return value if finite else str(value)
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+
+
+def _described(keys: set[str]) -> list[dict[str, Any]]:
+    """The figures in the order of their tables; those without a label last, as secondary."""
+    order = {key: n for n, key in enumerate(FIGURES)}
+    result = []
+    for key in sorted(keys, key=lambda k: (order.get(k, len(order)), k)):
+        label, unit = FIGURES.get(key, (key.replace("_", " "), ""))
+        best = "low"
+        if key in _HIGHER_IS_BETTER:
+            best = "high"
+        elif key in _ZERO_IS_BEST:
+            best = "zero"
+        elif key in _NEITHER or key not in FIGURES:
+            best = "none"
+        main = key in FIGURES
+        result.append({"key": key, "label": label, "unit": unit, "best": best, "main": main})
+    return result
+
+
+def _histograms(distortions: Sequence[Distortion | None]) -> list[dict[str, Any]]:
+    """For each energy edges shared by all runs, and each run's share of area between them."""
+    known = [distortion for distortion in distortions if distortion is not None]
+    result: list[dict[str, Any]] = []
+    for energy in _HISTOGRAMS:
+        pooled = np.concatenate([d.values[energy] for d in known]) if known else np.zeros(0)
+        pooled = pooled[np.isfinite(pooled) & (pooled > 0)]
+        if not len(pooled):
+            continue
+        low, high = np.percentile(pooled, [0.5, 99.5])
+        edges = np.geomspace(low, max(high, 1.001 * low), _BINS + 1)
+        shares = [None if d is None else _shares(d, energy, edges) for d in distortions]
+        result.append({"name": energy, "edges": _rounded(edges), "shares": shares})
+    return result
+
+
+def _shares(distortion: Distortion, energy: str, edges: np.ndarray) -> list[float]:
+    """Percent of the source's area in each bin; what lies beyond counts in the outermost ones."""
+    values = np.nan_to_num(distortion.values[energy], nan=np.inf)
+    inside = np.clip(values, edges[0], edges[-1])
+    counts = np.histogram(inside, bins=edges, weights=distortion.areas)[0]
+    return _rounded(100 * counts / distortion.areas.sum())
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [float(f"{value:.5g}") for value in values]
+
+
+def _packed(shape: Shape, arrays: _Arrays) -> dict[str, Any]:
+    colours = {}
+    for name, values in shape.colours.items():
+        finite = np.where(np.isfinite(values), values, np.nan)
+        known = finite[np.isfinite(finite)]
+        colours[name] = {
+            "values": arrays.add(finite),
+            "of": "faces" if len(values) == len(shape.faces) else "vertices",
+            "range": _rounded(np.percentile(known, [1, 98]) if len(known) else np.zeros(2)),
+        }
+    return {
+        "name": shape.name,
+        "vertices": arrays.add(shape.vertices),
+        "faces": arrays.add(shape.faces),
+        "colours": colours,
+        "up": _rounded(shape.frame[1]),
+        "towards": _rounded(shape.frame[2]),
+    }

@@ -1,0 +1,84 @@
+"""Learning curves of a run, from its TensorBoard event files and CSV logs."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
+
+_POINTS = 500  # of a curve; more would only make the page larger
+_NO_CURVES = ("hp_metric", "epoch")
+
+
+class Curve(NamedTuple):
+    """A scalar over the training: steps, values, and seconds since the first value, if known."""
+
+    steps: list[int]
+    values: list[float | None]
+    seconds: list[float] | None
+
+
+def read_curves(folder: Path) -> tuple[dict[str, Curve], list[str]]:
+    """The curves of a run folder by their tags, and remarks on files that are damaged."""
+    curves: dict[str, Curve] = {}
+    remarks = []
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)
+    for file in sorted(folder.rglob("metrics.csv")):
+        try:
+            curves.update(_from_csv(file))
+        except (OSError, ValueError, csv.Error) as error:
+            remarks.append(f"{file.relative_to(folder)}: {' '.join(str(error).split())[:120]}")
+    for place in sorted({file.parent for file in folder.rglob("events.out.tfevents.*")}):
+        try:
+            curves.update(_from_events(place))
+        except Exception as error:  # the reader has no exception of its own for damaged files
+            remarks.append(f"{place.relative_to(folder)}: {' '.join(str(error).split())[:120]}")
+    return {tag: curves[tag] for tag in sorted(curves)}, remarks
+
+
+def _from_events(place: Path) -> dict[str, Curve]:
+    reader = EventAccumulator(str(place), size_guidance={SCALARS: 0})
+    reader.Reload()
+    curves = {}
+    for tag in reader.Tags()[SCALARS]:
+        if tag in _NO_CURVES:
+            continue
+        # a resumed run repeats the steps after its last checkpoint: the later value counts
+        events = {event.step: event for event in reader.Scalars(tag)}
+        kept = _thinned(sorted(events))
+        start = events[kept[0]].wall_time
+        curves[tag] = Curve(
+            kept,
+            [_finite(events[step].value) for step in kept],
+            [round(events[step].wall_time - start, 3) for step in kept],
+        )
+    return curves
+
+
+def _from_csv(file: Path) -> dict[str, Curve]:
+    with file.open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    values: dict[str, dict[int, float]] = {}
+    for row in rows:
+        for tag, text in row.items():
+            if tag not in ("step", *_NO_CURVES) and tag and text:
+                values.setdefault(tag, {})[int(row["step"])] = float(text)
+    curves = {}
+    for tag, by_step in values.items():
+        kept = _thinned(sorted(by_step))
+        curves[tag] = Curve(kept, [_finite(by_step[step]) for step in kept], None)
+    return curves
+
+
+def _thinned(steps: list[int]) -> list[int]:
+    stride = -(-len(steps) // _POINTS)
+    kept = steps[::stride]
+    return kept if kept[-1] == steps[-1] else [*kept, steps[-1]]
+
+
+def _finite(value: float) -> float | None:
+    return float(f"{value:.6g}") if math.isfinite(value) else None

@@ -1,0 +1,159 @@
+"""Runs found in folders: their settings and figures, flat."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from nsm.errors import NsmError
+
+# settings that change nothing in a result
+_INCIDENTAL = ("resume", "logger", "artefacts", "trainer.progress")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A complete run.
+
+    Attributes:
+        folder: where it lies.
+        name: its path below the folder in which it was found.
+        task: overfit, param, ...
+        settings: "group.key" to value.
+        figures: name to number; None for one that is not finite.
+    """
+
+    folder: Path
+    name: str
+    task: str
+    settings: dict[str, Any]
+    figures: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Incomplete:
+    """A run, or a part of one, that cannot be shown, and why."""
+
+    name: str
+    reason: str
+
+
+def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
+    """All runs in the folders, however deep, in the order of their names.
+
+    Raises:
+        NsmError: a folder that is not there; no run at all.
+    """
+    runs: list[Run] = []
+    incomplete: list[Incomplete] = []
+    seen: set[Path] = set()
+    for folder in folders:
+        if not folder.is_dir():
+            raise NsmError(f"{folder}: no such folder; give folders of runs or sweeps")
+        for place in _run_folders(folder):
+            if place.resolve() in seen:
+                continue
+            seen.add(place.resolve())
+            inner = place.relative_to(folder).as_posix()
+            name = place.resolve().name if inner == "." else inner
+            if len(folders) > 1 and inner != ".":
+                name = f"{folder.resolve().name}/{inner}"
+            if not (place / "metrics.json").exists():
+                incomplete.append(Incomplete(name, "no metrics.json: not finished"))
+                continue
+            try:
+                runs.append(_read(place, name))
+            except NsmError as error:
+                incomplete.append(Incomplete(name, str(error)))
+    if not runs and not incomplete:
+        words = ", ".join(str(folder) for folder in folders)
+        raise NsmError(f"{words}: no run there; a run's folder has a metrics.json")
+    return runs, incomplete
+
+
+def _run_folders(folder: Path) -> Iterator[Path]:
+    for path, inner, files in os.walk(folder):
+        inner.sort(key=lambda name: (len(name), name) if name.isdigit() else (0, name))
+        if "metrics.json" in files or "config.yaml" in files:
+            yield Path(path)
+        if "metrics.json" in files:
+            inner.clear()  # what lies in a run's folder belongs to it
+
+
+def _read(folder: Path, name: str) -> Run:
+    try:
+        words = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        figures = _figures(words)
+    except (OSError, ValueError, RecursionError, TypeError) as error:
+        raise NsmError(f"metrics.json is damaged: {_short(error)}") from error
+    try:
+        config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+        if not isinstance(config, dict):
+            raise ValueError("no settings in it")
+        settings = dict(_flat(config))
+        task = settings.pop("task.name")
+    except FileNotFoundError as error:
+        raise NsmError("config.yaml is missing") from error
+    except Exception as error:  # whatever a damaged or foreign file raises
+        raise NsmError(f"config.yaml is damaged: {_short(error)}") from error
+    return Run(folder, name, str(task), settings, figures)
+
+
+def _flat(words: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in words.items():
+        name = f"{prefix}{key}"
+        if name in _INCIDENTAL:
+            continue
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def _figures(words: Any) -> dict[str, float | None]:
+    """Numbers of metrics.json by one name each.
+
+    Of ``task=param`` those of nsm have plain names, those of a collection's pairs their mean.
+    """
+    if not isinstance(words, Mapping) or not isinstance(words.get("metrics"), Mapping):
+        raise ValueError("no figures in it")
+    figures: dict[str, float | None] = {}
+    for key in ("steps", "seconds"):
+        if key in words:
+            figures[key] = _number(words[key])
+    aside: dict[str, float | None] = {}
+    for key, value in words["metrics"].items():
+        if key == "nsm" and isinstance(value, Mapping):
+            figures.update({k: _number(v) for k, v in value.items()})
+        elif key == "pairs" and isinstance(value, Mapping):
+            for name in next(iter(value.values()), {}):
+                of_pairs = [_number(pair.get(name)) for pair in value.values()]
+                known = [number for number in of_pairs if number is not None]
+                figures[name] = sum(known) / len(known) if len(known) == len(of_pairs) else None
+                aside.update(
+                    {f"{pair}: {name}": n for pair, n in zip(value, of_pairs, strict=True)}
+                )
+        elif isinstance(value, Mapping):
+            aside.update({f"{key}: {k}": _number(v) for k, v in value.items()})
+        else:
+            figures[key] = _number(value)
+    return {**figures, **aside}
+
+
+def _number(value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{str(value)[:40]!r} is not a number")
+    # JSON of other writers may hold NaN
+    return value if abs(value) < float("inf") else None
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__

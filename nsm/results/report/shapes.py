@@ -1,0 +1,174 @@
+"""What a run made, as shapes to turn and as distortion measured on its triangles."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nsm.errors import NsmError
+from nsm.results.artifact import load_surface
+from nsm.results.collection import load_collection
+from nsm.results.map_metrics import triangle_metric
+from nsm.results.metrics import vertex_error
+from nsm.results.pair_metrics import ENERGIES
+from nsm.results.parameterization import load_parameterization
+from nsm.results.render import view_frame
+from nsm.results.surface_map import SurfaceMap, load_surface_map
+from nsm.surfaces.geometry import decimate
+from nsm.surfaces.topology import face_areas
+
+_FACES = 50_000  # of a shape; finer meshes are coarsened for the page
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A mesh to look at: (V, 3), (F, 3), with values (V,) or (F,) by which it is coloured."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: dict[str, np.ndarray]
+    frame: np.ndarray
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Energies (F,) of triangles by name, and these triangles' areas (F,) on the source."""
+
+    values: dict[str, np.ndarray]
+    areas: np.ndarray
+
+
+def read_shapes(task: str, folder: Path) -> tuple[list[Shape], Distortion]:
+    """The shapes of a run, and the distortion of its map over the triangles of the mesh.
+
+    For ``overfit`` the map is the mesh to φ; for a collection all pairs count together.
+
+    Raises:
+        NsmError: artefacts that are missing, damaged, or of a task that makes none.
+    """
+    if task not in _READERS:
+        raise NsmError(f"task {task} has no shapes")
+    try:
+        return _READERS[task](folder)
+    except (ValueError, IndexError, RuntimeError) as error:  # arrays that do not fit together
+        raise NsmError(f"not readable: {' '.join(str(error).split())[:120]}") from error
+
+
+def _overfit(folder: Path) -> tuple[list[Shape], Distortion]:
+    neural = load_surface(folder)
+    surface = neural.surface
+    vertices, faces, _ = neural.to_mesh()
+    distortion = _measured(surface.vertices, vertices, faces)
+    colours = {
+        "distance, % of diagonal": vertex_error(surface, neural.map),
+        "normal error, degrees": _face_angles(vertices, surface.vertices, faces),
+        **distortion.values,
+    }
+    frame = view_frame(surface.vertices)
+    shapes = [
+        _shape("neural surface", vertices, faces, colours, frame),
+        _shape("source mesh", surface.vertices, faces, {}, frame),
+    ]
+    return shapes, distortion
+
+
+def _param(folder: Path) -> tuple[list[Shape], Distortion]:
+    result = load_parameterization(folder)
+    surface, uv = result.phi.surface, result.uv
+    flat = np.column_stack([uv, np.zeros(len(uv))])
+    distortion = _measured(surface.vertices, flat, surface.faces)
+    shapes = [
+        _shape("flattened", flat, surface.faces, distortion.values, np.eye(3)),
+        _shape("surface", surface.vertices, surface.faces, distortion.values),
+    ]
+    return shapes, distortion
+
+
+def _pair_map(folder: Path) -> tuple[list[Shape], Distortion]:
+    f = load_surface_map(folder)
+    image, source, distortion = _both_ends(f)
+    return [image("mapped onto the target"), source("source")], distortion
+
+
+def _collection_map(folder: Path) -> tuple[list[Shape], Distortion]:
+    collection = load_collection(folder)
+    shapes, parts = [], []
+    for i, j in itertools.permutations(range(len(collection)), 2):
+        f = collection.pair(i, j)
+        image, source, distortion = _both_ends(f)
+        names = f.source.surface.name, f.target.surface.name
+        shapes.append(image(f"{names[0]} → {names[1]}"))
+        if j == (i + 1) % len(collection):
+            shapes.append(source(names[0]))
+        parts.append(distortion)
+    values = {name: np.concatenate([part.values[name] for part in parts]) for name in _NAMES}
+    return shapes, Distortion(values, np.concatenate([part.areas for part in parts]))
+
+
+_READERS: dict[str, Callable[[Path], tuple[list[Shape], Distortion]]] = {
+    "overfit": _overfit,
+    "param": _param,
+    "pair_map": _pair_map,
+    "collection_map": _collection_map,
+}
+_NAMES = [energy.__name__.replace("_", " ") for energy in ENERGIES]
+
+
+def _both_ends(
+    f: SurfaceMap,
+) -> tuple[Callable[[str], Shape], Callable[[str], Shape], Distortion]:
+    """Makers of the mapped mesh and of the source, by name, and the map's distortion."""
+    surface = f.source.surface
+    distortion = _measured(surface.vertices, f.image, surface.faces)
+    # one colour for a point and its image, so that the correspondence is seen
+    places = {f"{axis} on the source": surface.vertices[:, k] for k, axis in enumerate("xyz")}
+    colours = {**distortion.values, **places}
+    frame = view_frame(f.target.surface.vertices)
+
+    def image(name: str) -> Shape:
+        return _shape(name, f.image, surface.faces, colours, frame)
+
+    def source(name: str) -> Shape:
+        return _shape(name, surface.vertices, surface.faces, colours)
+
+    return image, source, distortion
+
+
+def _measured(source: np.ndarray, image: np.ndarray, faces: np.ndarray) -> Distortion:
+    a, b = triangle_metric(source, faces), triangle_metric(image, faces)
+    values = [energy(a, b).numpy() for energy in ENERGIES]
+    return Distortion(dict(zip(_NAMES, values, strict=True)), face_areas(source, faces))
+
+
+def _face_angles(vertices: np.ndarray, reference: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Angles (F,) in degrees between the normals that two meshes have at the same faces."""
+    a, b = (
+        np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]])
+        for p in (vertices, reference)
+    )
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.degrees(np.arctan2(sine, (a * b).sum(axis=1)))
+
+
+def _shape(
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colours: dict[str, np.ndarray],
+    frame: np.ndarray | None = None,
+) -> Shape:
+    if frame is None:
+        frame = view_frame(vertices)
+    if len(faces) <= _FACES:
+        return Shape(name, vertices, faces, colours, frame)
+    kept, coarse, birth = decimate(vertices, faces, _FACES)
+    taken = {
+        key: values[kept] if len(values) == len(vertices) else values[birth]
+        for key, values in colours.items()
+    }
+    return Shape(name, vertices[kept], coarse, taken, frame)

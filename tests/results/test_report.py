@@ -1,0 +1,355 @@
+"""The report: what is on the page against the runs themselves, and the page in a real browser."""
+
+import base64
+import gzip
+import io
+import json
+import re
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nsm.config import compose_config
+from nsm.pipeline import run
+from nsm.results import load_surface
+from nsm.results.report import write_report
+
+TINY = [
+    "surface=hemisphere",
+    "experiment=quick",
+    "data.batch_size=256",
+    "data.steps_per_epoch=10",
+    "data.held_out=256",
+    "trainer.max_steps=20",
+    "trainer.progress=false",
+    "logger.every=5",
+    "logger.pictures=0",
+    "artefacts=false",
+]
+HOSTILE = "<img src=x onerror=window.pwned=1> %{x} <b>bold<"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Path:
+    """Two overfits as a sweep, a flattening and a map; one run is interrupted, another damaged."""
+    folder = tmp_path_factory.mktemp("runs")
+    sweep = folder / "sweep"
+    for name, activation in ((HOSTILE, "silu"), ("1", "relu")):
+        run(compose_config([*TINY, f"activation={activation}"]), sweep / name)
+    Image.fromarray(np.full((40, 60, 3), 90, np.uint8)).save(sweep / "1" / "error.png")
+    ready = f"phi.path={sweep / '1'}"
+    run(compose_config(["task=param", ready, *TINY]), folder / "flat")
+    ends = [f"source={sweep / '1'}", "target=sphere_cap"]
+    run(compose_config(["task=pair_map", *ends, *TINY]), folder / "map")
+    shutil.copytree(sweep / "1", folder / "interrupted")
+    (folder / "interrupted" / "metrics.json").unlink()
+    shutil.copytree(sweep / "1", folder / "truncated")
+    (folder / "truncated" / "metrics.json").write_text('{"steps": 20, "metri')
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(runs, tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("page") / "report.html"
+    assert write_report([runs], file, f"Title {HOSTILE}") == (4, 2)
+    return file
+
+
+def content(page: Path) -> dict:
+    packed = re.search(r'id="content">([^<]*)<', page.read_text()).group(1)
+    return json.loads(gzip.decompress(base64.b64decode(packed)))
+
+
+def task(page: Path, name: str) -> dict:
+    return next(one for one in content(page)["tasks"] if one["name"] == name)
+
+
+def unpacked(words: dict, index: int) -> np.ndarray:
+    stored = words["arrays"][index]
+    return np.frombuffer(base64.b64decode(stored["data"]), "<" + stored["type"])
+
+
+def test_figures_and_settings_are_those_of_the_runs(runs, page):
+    overfit = task(page, "overfit")
+    assert overfit["differing"][0] == "activation.name"
+    assert {one["label"] for one in overfit["runs"]} >= {"activation=silu", "activation=relu"}
+    for one in overfit["runs"]:
+        words = json.loads((runs / one["name"] / "metrics.json").read_text())
+        assert one["figures"].items() >= words["metrics"].items()
+        assert one["figures"]["steps"] == 20
+    flat = task(page, "param")["runs"][0]["figures"]
+    words = json.loads((runs / "flat" / "metrics.json").read_text())["metrics"]
+    assert flat.items() >= words["nsm"].items()
+    assert flat["SLIM (libigl): area_median"] == words["SLIM (libigl)"]["area_median"]
+
+
+def test_curves_end_at_the_last_step(page):
+    curves = task(page, "overfit")["runs"][0]["curves"]
+    assert curves["val/rms_percent"]["steps"][-1] >= 19
+    assert all(value > 0 for value in curves["train/loss"]["values"])
+    assert curves["train/loss"]["seconds"][0] == 0
+
+
+def test_a_csv_log_gives_curves_too(runs, tmp_path):
+    shutil.copytree(runs / "sweep" / "1", tmp_path / "run")
+    log = "epoch,step,val/own\n0,0,3.5\n0,10,\n0,20,nan\n0,30,1.5\n"
+    (tmp_path / "run" / "metrics.csv").write_text(log)
+    write_report([tmp_path], tmp_path / "report.html")
+    curve = task(tmp_path / "report.html", "overfit")["runs"][0]["curves"]["val/own"]
+    assert (curve["steps"], curve["values"]) == ([0, 20, 30], [3.5, None, 1.5])
+
+
+def test_histograms_are_the_distortion_of_the_triangles(runs, page):
+    overfit = task(page, "overfit")
+    number = [one["name"] for one in overfit["runs"]].index("sweep/1")
+    phi = load_surface(runs / "sweep" / "1")
+    image, values, areas = phi(phi.surface.uv), [], []
+    for corners in phi.surface.faces:
+        x, y = phi.surface.vertices[corners], image[corners]
+        e, g = np.stack([x[1] - x[0], x[2] - x[0]], 1), np.stack([y[1] - y[0], y[2] - y[0]], 1)
+        q, r = np.linalg.qr(e)
+        sigma = np.linalg.svd(g @ np.linalg.inv(r), compute_uv=False)
+        values.append((sigma**2).sum() + (1 / (sigma**2 + 0.01)).sum())
+        areas.append(abs(np.linalg.det(r)))
+    values, areas = np.array(values), np.array(areas)
+    shown = next(one for one in overfit["histograms"] if one["name"] == "symmetric dirichlet")
+    shares, edges = np.array(shown["shares"][number]), np.array(shown["edges"])
+    assert shares.sum() == pytest.approx(100, abs=0.1)
+    for k in (15, 30, 45):
+        below = 100 * areas[values < edges[k]].sum() / areas.sum()
+        assert shares[:k].sum() == pytest.approx(below, abs=0.2)
+
+
+def test_shapes_are_those_of_the_runs_and_shared_arrays_are_stored_once(runs, page):
+    words = content(page)
+    overfit = next(one for one in words["tasks"] if one["name"] == "overfit")
+    for one in overfit["runs"]:
+        phi = load_surface(runs / one["name"])
+        shape = one["shapes"][0]
+        vertices = unpacked(words, shape["vertices"]).reshape(-1, 3)
+        assert np.allclose(vertices, phi(phi.surface.uv), atol=1e-5)
+        assert np.array_equal(unpacked(words, shape["faces"]).reshape(-1, 3), phi.surface.faces)
+    assert len({one["shapes"][0]["faces"] for one in overfit["runs"]}) == 1
+    mapped = next(one for one in words["tasks"] if one["name"] == "pair_map")["runs"][0]
+    assert [shape["name"] for shape in mapped["shapes"]] == ["mapped onto the target", "source"]
+
+
+def test_incomplete_and_damaged_runs_are_listed(runs, page, tmp_path):
+    reasons = {item["name"]: item["reason"] for item in content(page)["incomplete"]}
+    assert "not finished" in reasons["interrupted"]
+    assert "metrics.json is damaged" in reasons["truncated"]
+    bad = tmp_path / "bad"
+    shutil.copytree(runs / "sweep" / "1", bad)
+    (bad / "surface.safetensors").write_bytes(b"short")
+    (bad / "error.png").write_bytes(b"\x89PNG")
+    next((bad / "tensorboard").glob("events*")).write_bytes(b"noise" * 100)
+    (bad / "metrics.csv").write_text("step,x\nten,1\n")
+    shutil.copytree(runs / "sweep" / "1", tmp_path / "worse")
+    (tmp_path / "worse" / "config.yaml").write_text("a: [")
+    write_report([tmp_path], tmp_path / "report.html")
+    words = content(tmp_path / "report.html")
+    told = [f"{item['name']}: {item['reason']}" for item in words["incomplete"]]
+    for part in ("surface.safetensors", "error.png", "metrics.csv", "worse: config.yaml"):
+        assert any(part in line for line in told), part
+    assert [one["name"] for one in words["tasks"][0]["runs"]] == ["bad"]
+
+
+def test_a_fine_mesh_is_coarsened_for_the_page(runs, monkeypatch, tmp_path):
+    monkeypatch.setattr("nsm.results.report.shapes._FACES", 100)
+    write_report([runs / "sweep" / "1"], tmp_path / "report.html")
+    words = content(tmp_path / "report.html")
+    phi = load_surface(runs / "sweep" / "1")
+    shape = words["tasks"][0]["runs"][0]["shapes"][0]
+    vertices = unpacked(words, shape["vertices"]).reshape(-1, 3)
+    faces = unpacked(words, shape["faces"]).reshape(-1, 3)
+    assert 50 < len(faces) <= 100 < len(phi.surface.faces)
+    known = phi(phi.surface.uv)
+    assert all(np.abs(known - vertex).max(axis=1).min() < 1e-5 for vertex in vertices[::7])
+    for colour in shape["colours"].values():
+        count = len(faces) if colour["of"] == "faces" else len(vertices)
+        assert len(unpacked(words, colour["values"])) == count
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["nowhere"], "nowhere"),
+        (["empty"], "no run"),
+        ([], "FOLDER"),
+        (["empty", "--outptu=x"], "--outptu"),
+        (["empty", "-o", "nowhere/report.html"], "nowhere"),
+        (["empty", "-o", "empty"], "is a folder"),
+    ],
+)
+def test_bad_words_are_one_line_and_status_2(tmp_path, here, words, expected):
+    (tmp_path / "empty").mkdir()
+    result = here("report", *words)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert expected in result.stderr
+    assert list(tmp_path.rglob("*.html")) == []
+
+
+def test_the_command_writes_the_page_and_says_where(runs, tmp_path, here):
+    result = here("report", str(runs / "sweep" / "1"))
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "1 run: report.html"
+    assert (tmp_path / "report.html").stat().st_size > 1_000_000
+
+
+# ---- in a browser
+
+
+@pytest.fixture(scope="module")
+def browser(page):
+    """Headless Chromium with the page in it."""
+    webdriver = pytest.importorskip("selenium.webdriver")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if not (chromium and driver):
+        pytest.skip("chromium and chromedriver are not installed")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for word in (
+        "headless",
+        "no-sandbox",
+        "disable-gpu",
+        "disable-quic",
+        "no-first-run",
+        "disable-background-networking",
+        "disable-component-update",
+        "disable-sync",
+        "use-angle=swiftshader",
+        "enable-unsafe-swiftshader",
+        "window-size=1400,1000",
+    ):
+        options.add_argument(f"--{word}")
+    profile = tempfile.mkdtemp()
+    options.add_argument(f"--user-data-dir={profile}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    service = webdriver.ChromeService(driver)
+    window = webdriver.Chrome(options=options, service=service)
+    try:
+        window.get(page.as_uri())
+        until(window, "return document.documentElement.dataset.state === 'ready'")
+        click(window, "#tasks button[data-name=overfit]")
+        yield window
+    finally:
+        window.quit()
+        shutil.rmtree(profile, ignore_errors=True)
+
+
+def until(window, question: str) -> None:
+    start = time.monotonic()
+    while not window.execute_script(question):
+        assert time.monotonic() - start < 60, question
+        time.sleep(0.1)
+
+
+def click(window, selector: str) -> None:
+    window.execute_script("document.querySelector(arguments[0]).click()", selector)
+
+
+def type_into(window, selector: str, text: str) -> None:
+    window.execute_script(
+        "const field = document.querySelector(arguments[0]); field.value = arguments[1];"
+        "field.dispatchEvent(new Event('input'))",
+        selector,
+        text,
+    )
+
+
+def names(window) -> list[str]:
+    rows = "#table tbody tr:not(.details) td.first button"
+    return window.execute_script(
+        "return [...document.querySelectorAll(arguments[0])].map(x => x.textContent)", rows
+    )
+
+
+def test_the_page_loads_nothing_and_complains_of_nothing(browser, page):
+    until(browser, "return document.querySelectorAll('#shapes canvas').length >= 2")
+    log = [json.loads(line["message"])["message"] for line in browser.get_log("performance")]
+    asked = [
+        entry["params"]["request"]["url"]
+        for entry in log
+        if entry["method"] == "Network.requestWillBeSent"
+        and entry["params"].get("documentURL", "").startswith("file:")
+    ]
+    assert page.as_uri() in asked
+    assert {url.split(":")[0] for url in asked} <= {"file", "data", "blob"}
+    assert [url for url in asked if url.startswith("file:")] == [page.as_uri()]
+    assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
+
+
+def test_names_from_files_do_not_become_markup(browser, page):
+    assert HOSTILE not in page.read_text()
+    assert browser.execute_script("return window.pwned") is None
+    assert browser.execute_script("return document.querySelectorAll('img[src=x], b').length") == 0
+    title = browser.execute_script("return document.querySelector('h1').textContent")
+    assert title == f"Title {HOSTILE}" == browser.title
+
+
+def test_the_table_sorts_and_filters(browser):
+    key = "th[data-key=rms_percent] button"
+    cells = "#table tbody tr td:nth-child(n)"
+    assert browser.execute_script(f"return document.querySelectorAll('{cells}').length") > 10
+    click(browser, key)
+    rising = names(browser)
+    click(browser, key)
+    assert names(browser) == rising[::-1]
+    assert set(rising) == {"activation=silu", "activation=relu"}
+    click(browser, key)
+    type_into(browser, "thead input[aria-label='filter activation.name']", "RELU")
+    assert names(browser) == ["activation=relu"]
+    # what is filtered out leaves the plots as well
+    plotted = "return document.querySelector('#curves .plot').data.map(x => x.name)"
+    assert browser.execute_script(plotted) == ["activation=relu"]
+    type_into(browser, "thead input[aria-label='filter activation.name']", "")
+    type_into(browser, "thead input[aria-label='filter RMS distance']", "< 0")
+    assert names(browser) == []
+    type_into(browser, "thead input[aria-label='filter RMS distance']", ">= 0")
+    assert len(names(browser)) == 2
+    type_into(browser, "thead input[aria-label='filter RMS distance']", "")
+    click(browser, "#table tbody input[type=checkbox]")
+    assert len(browser.execute_script(plotted)) == 1
+    click(browser, "#table tbody input[type=checkbox]")
+    assert len(browser.execute_script(plotted)) == 2
+
+
+def test_a_shape_is_seen_and_turns_with_its_neighbours(browser):
+    until(browser, "return document.querySelectorAll('#shapes canvas').length >= 2")
+    view = browser.find_element("css selector", "#shapes .view")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", view)
+    time.sleep(1)
+    before = picture(view)
+    assert before.std() > 15, "an empty view"
+    browser.execute_script(
+        "Plotly.relayout(document.querySelector('#shapes .view'),"
+        "{'scene.camera': {eye: {x: 0, y: 0.1, z: -2}, up: {x: 0, y: 1, z: 0}}})"
+    )
+    until(
+        browser,
+        "return [...document.querySelectorAll('#shapes .view')]"
+        ".every(v => v.layout.scene.camera.eye.z === -2)",
+    )
+    time.sleep(1)
+    assert np.abs(picture(view) - before).mean() > 2
+
+
+def picture(element) -> np.ndarray:
+    image = Image.open(io.BytesIO(element.screenshot_as_png)).convert("L")
+    return np.asarray(image, dtype=float)
+
+
+def test_other_tasks_and_what_is_damaged_are_on_the_page(browser):
+    click(browser, "#tasks button[data-name=param]")
+    until(browser, "return document.querySelectorAll('#shapes .view').length === 1")
+    shapes = "return [...document.querySelectorAll('#shapes select')[0].options].map(x => x.value)"
+    assert browser.execute_script(shapes) == ["flattened", "surface"]
+    listed = browser.execute_script("return document.querySelector('#incomplete').innerText")
+    assert "interrupted" in listed and "truncated" in listed
+    click(browser, "#tasks button[data-name=overfit]")
