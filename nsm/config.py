@@ -47,6 +47,12 @@ class SeamSchema:
 
 
 @dataclass
+class GuaranteeSchema:
+    repair: bool = MISSING
+    rounds: int = MISSING
+
+
+@dataclass
 class AttributesSchema:
     source: str | None = None
     target: str | None = None
@@ -101,6 +107,7 @@ class Schema:
     landmarks: Any = None
     attributes: AttributesSchema = field(default_factory=AttributesSchema)
     seam: SeamSchema = field(default_factory=SeamSchema)
+    guarantee: GuaranteeSchema = field(default_factory=GuaranteeSchema)
     map: MapSchema = field(default_factory=MapSchema)
     activation: dict[str, Any] = MISSING
     encoding: dict[str, Any] = MISSING

@@ -15,7 +15,8 @@ from rich.console import Console
 
 from nsm.data import CollectionData
 from nsm.errors import NsmError
-from nsm.pipeline.common import built, fitted, plain, with_map, write_figures
+from nsm.pipeline.common import built, fitted, frozen, plain, with_map, write_figures
+from nsm.pipeline.guarantee import guaranteed
 from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.pipeline.pair_map import absolute_paths
 from nsm.results import (
@@ -96,14 +97,23 @@ def run_collection_map(
         f"collection_map of {len(phis)} surfaces",
         resuming=resuming,
     )
-    maps = [h.cpu().eval().requires_grad_(False) for h in module.map]
-    result = SurfaceCollection(phis, maps, np.stack(ids, axis=1), {}, settings)
+
+    def made() -> SurfaceCollection:
+        maps = [frozen(h) for h in module.map]
+        return SurfaceCollection(phis, maps, np.stack(ids, axis=1), {}, settings)
+
+    result, certificate = guaranteed(config, trainer, module, made, console)
     result.metrics.update(collection_metrics(result, points, matched.points))
     result.save(folder)
     if config.artefacts:
         _write_artefacts(folder, result)
     names = [phi.surface.name for phi in phis]
-    figures = {"surfaces": names, "landmarks": len(ids[0]), "metrics": result.metrics}
+    figures = {
+        "surfaces": names,
+        "landmarks": len(ids[0]),
+        **certificate,
+        "metrics": result.metrics,
+    }
     write_figures(folder, first, trainer, started, figures)
     console.print(collection_table(result.metrics))
     console.print(f"results in {folder}", soft_wrap=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 import time
@@ -53,6 +54,11 @@ def with_map(settings: dict[str, Any], **network: Any) -> dict[str, Any]:
         "scheduler": settings["scheduler"],
         "max_steps": settings["trainer"]["max_steps"],
     }
+
+
+def frozen(network: torch.nn.Module) -> Any:
+    """A copy of a trained network as results hold it: on the CPU, and no more to be trained."""
+    return copy.deepcopy(network).cpu().eval().requires_grad_(False)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -53,6 +53,7 @@ _INCIDENTAL = (
     "artefacts",
     "seam",
     "constraints",
+    "guarantee",
 )
 
 

@@ -15,7 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.common import built, plain, train, with_map, write_figures
+from nsm.pipeline.common import built, frozen, plain, train, with_map, write_figures
+from nsm.pipeline.guarantee import guaranteed
 from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.results import (
     NeuralSurface,
@@ -92,11 +93,14 @@ def run_pair_map(
         resuming=resuming,
         title=f"{phi.surface.name} → {psi.surface.name}",
     )
-    h = module.map.cpu().eval().requires_grad_(False)
-    result = SurfaceMap(phi, psi, h, np.stack(ids, axis=1), {}, settings)
-    result.metrics.update(
-        pair_metrics(phi.surface, psi.surface, result.image_uv, evaluate(h, points), targets)
-    )
+
+    def made() -> SurfaceMap:
+        return SurfaceMap(phi, psi, frozen(module.map), np.stack(ids, axis=1), {}, settings)
+
+    result, certificate = guaranteed(config, trainer, module, made, console)
+    landed = result.planar(points) if len(points) else points
+    result.metrics.update(pair_metrics(phi.surface, psi.surface, result.image_uv, landed, targets))
+    result.metrics.update(result.certificate)
     result.save(folder)
     if config.artefacts:
         _write_artefacts(folder, result)
@@ -106,7 +110,12 @@ def run_pair_map(
         phi.surface,
         trainer,
         started,
-        {"target": psi.surface.name, "landmarks": len(ids[0]), "metrics": result.metrics},
+        {
+            "target": psi.surface.name,
+            "landmarks": len(ids[0]),
+            **certificate,
+            "metrics": result.metrics,
+        },
     )
     console.print(pair_table(result.metrics))
     console.print(f"results in {folder}", soft_wrap=True)

@@ -11,7 +11,8 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.pipeline.common import built, plain, train, with_map, write_figures
+from nsm.pipeline.common import built, frozen, plain, train, with_map, write_figures
+from nsm.pipeline.guarantee import guaranteed
 from nsm.pipeline.overfit import neural_surface
 from nsm.results import (
     NeuralSurface,
@@ -62,8 +63,11 @@ def run_param(
 
     pictures = Pictures("layout", picture, config.logger.pictures)
     trainer = train(config, folder, surface, module, console, pictures, resuming=resuming)
-    planar = module.map.cpu().eval().requires_grad_(False)
-    result = Parameterization(phi, planar, {}, plain(config))
+
+    def made() -> Parameterization:
+        return Parameterization(phi, frozen(module.map), {}, plain(config))
+
+    result, certificate = guaranteed(config, trainer, module, made, console)
     maps = {"domain": surface.uv, "nsm": result.uv}
     for name, method in BASELINES.items():
         try:
@@ -72,11 +76,13 @@ def run_param(
             console.print(f"  {name} of libigl failed: {error}")
     for name, uv in maps.items():
         result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
+    result.metrics["nsm"].update(result.certificate)
 
     result.save(folder)
     if config.artefacts:
         _write_artefacts(folder, result)
-    write_figures(folder, surface, trainer, started, {"metrics": result.metrics})
+    figures = {**certificate, "metrics": result.metrics}
+    write_figures(folder, surface, trainer, started, figures)
     console.print(comparison_table(result.metrics))
     ours = result.metrics["nsm"]
     if ours["flipped_percent"] == 0 and ours["boundary_self_intersections"]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,17 @@ from torch import nn
 
 from nsm.maps import Between, Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.certificate import Correction, together
 from nsm.results.files import misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.surface_map import SurfaceMap
+from nsm.surfaces.location import locate
 
 FORMAT = "nsm-collection"
 VERSION = 1
 STEM = "collection"
+_CYCLE_EVERY = 7  # vertices, of which one is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,7 @@ class SurfaceCollection:
         landmarks: (L, k) vertices of the mesh files.
         metrics: figures of :func:`collection_metrics`.
         config: the settings of the run that made it.
+        corrections: of the pairs (source, target) that :meth:`mended` had to mend.
     """
 
     surfaces: list[NeuralSurface]
@@ -42,19 +45,32 @@ class SurfaceCollection:
     landmarks: np.ndarray
     metrics: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    corrections: dict[tuple[int, int], Correction] = field(default_factory=dict)
+    _made: dict[tuple[int, int], SurfaceMap] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.surfaces)
 
     def pair(self, source: int, target: int) -> SurfaceMap:
         """The map F_{source→target}: points, transfer and morph from any surface to any other."""
-        return self._pairs(source, target)
+        if (source, target) not in self._made:
+            self._made[source, target] = self._pair(source, target)
+        return self._made[source, target]
 
     @property
-    def _pairs(self) -> Any:
-        if "_cached_pairs" not in self.__dict__:
-            self.__dict__["_cached_pairs"] = cache(self._pair)
-        return self.__dict__["_cached_pairs"]
+    def certificate(self) -> dict[str, Any]:
+        """Whether the maps of all ordered pairs are injective (see :func:`certificate`)."""
+        return together(self.pair(*ends).certificate for ends in self._ordered)
+
+    def mended(self) -> SurfaceCollection:
+        """The collection with :meth:`SurfaceMap.mended` maps."""
+        made = {ends: self.pair(*ends).mended() for ends in self._ordered}
+        corrections = {ends: f.correction for ends, f in made.items() if len(f.correction.vertices)}
+        return replace(self, corrections=corrections, _made=made)
+
+    @property
+    def _ordered(self) -> Iterator[tuple[int, int]]:
+        return itertools.permutations(range(len(self)), 2)
 
     def _pair(self, source: int, target: int) -> SurfaceMap:
         # h_i is near the rotation that it started from, so the surface's vertices, turned back,
@@ -65,9 +81,9 @@ class SurfaceCollection:
         onto = first.inner.config.get("onto")  # type: ignore[union-attr, operator]
         h = Between(_double(first), _double(self.maps[target]), nodes, onto)
         ids = self.landmarks[:, [source, target]]
-        return SurfaceMap(
-            self.surfaces[source], self.surfaces[target], h.eval(), ids, {}, self.config
-        )
+        ends = self.surfaces[source], self.surfaces[target]
+        correction = self.corrections.get((source, target), Correction())
+        return SurfaceMap(*ends, h.eval(), ids, {}, self.config, correction)
 
     def save(self, folder: str | Path) -> None:
         """Write the maps into a folder, and each surface into ``surface_0``, ... there.
@@ -80,6 +96,8 @@ class SurfaceCollection:
         for k, (surface, h) in enumerate(zip(self.surfaces, self.maps, strict=True)):
             save_surface(place / f"surface_{k}", surface)
             tensors.update({f"{k}.{n}": v.contiguous() for n, v in h.state_dict().items()})
+        for (i, j), correction in self.corrections.items():
+            tensors.update(correction.tensors(f"{i}_to_{j}."))
         words = {
             "map": self.maps[0].inner.config,  # type: ignore[union-attr]
             "count": len(self),
@@ -100,6 +118,15 @@ def load_collection(folder: str | Path) -> SurfaceCollection:
     tensors, words = read_pair(place / STEM, FORMAT, VERSION)
     try:
         count = int(words["count"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise misfit(place / STEM, error) from error
+    surfaces = [load_surface(place / f"surface_{k}") for k in range(count)]
+    try:
+        corrections = {}
+        for i, j in itertools.permutations(range(count), 2):
+            found = Correction.taken(tensors, len(surfaces[i].surface.vertices), f"{i}_to_{j}.")
+            if len(found.vertices):
+                corrections[i, j] = found
         maps: list[nn.Module] = []
         for k in range(count):
             h = Rotated(build_planar(words["map"]), torch.eye(2))
@@ -112,8 +139,7 @@ def load_collection(folder: str | Path) -> SurfaceCollection:
         metrics, config = dict(words["metrics"]), dict(words["config"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise misfit(place / STEM, error) from error
-    surfaces = [load_surface(place / f"surface_{k}") for k in range(count)]
-    return SurfaceCollection(surfaces, maps, landmarks, metrics, config)
+    return SurfaceCollection(surfaces, maps, landmarks, metrics, config, corrections)
 
 
 def collection_metrics(
@@ -127,34 +153,48 @@ def collection_metrics(
         targets: (K, 2) the same in each surface's own domain.
 
     Returns:
-        ``pairs``: "i → j" to the figures of :func:`nsm.results.pair_metrics`; cycle_error_mean and
-        _max_percent: how far i→j→k→i misses a vertex, of the diagonal, over all cycles.
+        ``pairs``: "i → j" to the figures of :func:`nsm.results.pair_metrics` and the map's
+        certificate; the certificate of all; cycle_error_mean and _max_percent: how far i→j→k→i
+        misses a vertex, of the diagonal, over all cycles; the same of the networks
+        (cycle_error_networks_...), which close but for where h_i⁻¹ is not found, while the maps
+        are linear on the triangles of each surface.
     """
     pairs = {}
     for i, j in itertools.permutations(range(len(collection)), 2):
         f = collection.pair(i, j)
         s, t = f.source.surface, f.target.surface
-        landed = evaluate(f.map, targets[i]) if len(points) else points
-        pairs[f"{s.name} → {t.name}"] = pair_metrics(s, t, f.image_uv, landed, targets[j])
-    errors = [
-        _cycle_error(collection, *c) for c in itertools.permutations(range(len(collection)), 3)
-    ]
-    return {
-        "pairs": pairs,
-        "cycle_error_mean_percent": float(np.mean([e.mean() for e in errors])),
-        "cycle_error_max_percent": float(max(e.max() for e in errors)),
-    }
+        landed = f.planar(targets[i]) if len(points) else points
+        own = pair_metrics(s, t, f.image_uv, landed, targets[j])
+        pairs[f"{s.name} → {t.name}"] = {**own, **f.certificate}
+    figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
+    for name, error in (("", _cycle_error), ("_networks", _networks_cycle_error)):
+        cycles = itertools.permutations(range(len(collection)), 3)
+        errors = [error(collection, *cycle) for cycle in cycles]
+        figures[f"cycle_error{name}_mean_percent"] = float(np.mean([e.mean() for e in errors]))
+        figures[f"cycle_error{name}_max_percent"] = float(max(e.max() for e in errors))
+    return figures
 
 
 def _cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
     """Distance (V,) between a vertex of i and its image by i→j→k→i, in percent of the diagonal."""
     surface = collection.surfaces[i]
-    start = surface.in_original_units(surface.surface.vertices[::7])
+    start = surface.in_original_units(surface.surface.vertices[::_CYCLE_EVERY])
     points = start
     for a, b in ((i, j), (j, k), (k, i)):
         points = collection.pair(a, b)(points)
     diagonal = surface.surface.bounding_box_diagonal / surface.surface.scale
     return 100 * np.linalg.norm(points - start, axis=1) / diagonal
+
+
+def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
+    """The same (V,) by the networks alone, from domain to domain."""
+    surface = collection.surfaces[i].surface
+    uv = surface.uv[::_CYCLE_EVERY]
+    for a, b in ((i, j), (j, k), (k, i)):
+        uv = evaluate(collection.pair(a, b).map, uv)
+    end = locate(uv, surface.uv, surface.faces).take(surface.vertices, surface.faces)
+    off = np.linalg.norm(end - surface.vertices[::_CYCLE_EVERY], axis=1)
+    return 100 * off / surface.bounding_box_diagonal
 
 
 def _double(h: nn.Module) -> nn.Module:

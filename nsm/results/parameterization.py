@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import numpy as np
 
 from nsm.maps import Planar, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.certificate import Correction, certificate, mended
 from nsm.results.files import misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
+from nsm.surfaces.location import locate
 
 FORMAT = "nsm-parameterization"
 VERSION = 1
@@ -25,24 +28,43 @@ class Parameterization:
     Attributes:
         phi: the surface.
         map: h, frozen.
-        metrics: figures of :func:`nsm.results.planar_metrics` by method: ``nsm``, the start
-            (``domain``), and those of libigl on the same mesh.
+        metrics: figures of :func:`nsm.results.planar_metrics` by method: ``nsm`` (with its
+            certificate), the start (``domain``), and those of libigl on the same mesh.
         config: the settings of the run that made it.
+        correction: vertices that :meth:`mended` moved off h, and where to.
     """
 
     phi: NeuralSurface
     map: Planar
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    correction: Correction = field(default_factory=Correction)
 
     def __call__(self, uv: np.ndarray) -> np.ndarray:
-        """Points (N, 2) of Ω to the plane (N, 2)."""
-        return evaluate(self.map, np.asarray(uv))
+        """Points (N, 2) of Ω to the plane (N, 2); linear on each triangle of the mesh."""
+        s = self.phi.surface
+        return locate(np.asarray(uv), s.uv, s.faces).take(self.uv, s.faces)
 
-    @property
+    @cached_property
     def uv(self) -> np.ndarray:
         """The new coordinates (V, 2) of the cut mesh's vertices, in its normalised units."""
-        return self(self.phi.surface.uv)
+        return self.correction.of(evaluate(self.map, self.phi.surface.uv))
+
+    @cached_property
+    def certificate(self) -> dict[str, Any]:
+        """Whether the new coordinates are injective (see :func:`certificate`)."""
+        return certificate(self.uv, self.phi.surface.faces, onto=self._onto)
+
+    @property
+    def _onto(self) -> bool:
+        return self.map.onto is not None
+
+    def mended(self) -> Parameterization:
+        """The map with its flipped triangles turned back, where that can be done."""
+        surface = self.phi.surface
+        nothing = np.zeros(len(surface.uv), dtype=bool)
+        better = mended(surface, self.uv, held=nothing, onto=self._onto)
+        return replace(self, correction=Correction.between(self.uv, better, self.correction))
 
     def save(self, folder: str | Path) -> None:
         """Write the surface and the map into a folder.
@@ -52,6 +74,7 @@ class Parameterization:
         """
         save_surface(folder, self.phi)
         tensors = {k: v.contiguous() for k, v in self.map.state_dict().items()}
+        tensors.update(self.correction.tensors())
         words = {"map": self.map.config, "metrics": self.metrics, "config": self.config}
         write_pair(Path(folder) / STEM, FORMAT, VERSION, tensors, words)
 
@@ -66,10 +89,11 @@ def load_parameterization(folder: str | Path) -> Parameterization:
     phi = load_surface(folder)
     tensors, words = read_pair(stem, FORMAT, VERSION)
     try:
+        correction = Correction.taken(tensors, len(phi.surface.vertices))
         planar = build_planar(words["map"])
         planar.load_state_dict(tensors)
         metrics, config = dict(words["metrics"]), dict(words["config"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise misfit(stem, error) from error
     planar.eval().requires_grad_(False)
-    return Parameterization(phi, planar, metrics, config)
+    return Parameterization(phi, planar, metrics, config, correction)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from torch import nn
 
 from nsm.maps import Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.certificate import Correction, certificate, mended
 from nsm.results.files import misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.surfaces import Surface
@@ -27,8 +28,9 @@ STEM = "pair"
 class SurfaceMap:
     """A map f from one surface to another, f∘φ = ψ∘h.
 
-    Points are in the units and place of the mesh files. Values are looked up on the meshes
-    themselves; the networks φ and ψ only served to find h.
+    Points are in the units and place of the mesh files. f is linear on each triangle of the source
+    in the target's domain, so that what is certified at the vertices holds for every point. Values
+    are looked up on the meshes themselves; the networks φ and ψ only served to find h.
 
     Attributes:
         source, target: the neural surfaces φ and ψ.
@@ -36,6 +38,7 @@ class SurfaceMap:
         landmarks: (L, 2) vertices of the two mesh files.
         metrics: figures of :func:`nsm.results.pair_metrics`.
         config: the settings of the run that made it.
+        correction: vertices of the source that :meth:`mended` moved off h, and where to.
     """
 
     source: NeuralSurface
@@ -44,6 +47,7 @@ class SurfaceMap:
     landmarks: np.ndarray
     metrics: dict[str, float] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    correction: Correction = field(default_factory=Correction)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.
@@ -53,12 +57,34 @@ class SurfaceMap:
         s, t = self.source.surface, self.target.surface
         normalised = (np.asarray(points, dtype=np.float64) - s.center) * s.scale
         uv = locate(normalised, s.vertices, s.faces).take(s.uv, s.faces)
-        return self.target.in_original_units(_lifted(t, evaluate(self.map, uv)))
+        return self.target.in_original_units(_lifted(t, self.planar(uv)))
+
+    def planar(self, uv: np.ndarray) -> np.ndarray:
+        """Points (N, 2) of the source's domain to those of the target's, (N, 2)."""
+        s = self.source.surface
+        return locate(uv, s.uv, s.faces).take(self.image_uv, s.faces)
 
     @cached_property
     def image_uv(self) -> np.ndarray:
-        """h at the source's vertices: (V, 2) in the target's domain."""
-        return evaluate(self.map, self.source.surface.uv)
+        """Where the source's vertices go: (V, 2) in the target's domain; h, but for corrections."""
+        return self.correction.of(evaluate(self.map, self.source.surface.uv))
+
+    @cached_property
+    def certificate(self) -> dict[str, Any]:
+        """Whether the map to the target's domain is injective (see :func:`certificate`)."""
+        return certificate(self.image_uv, self.source.surface.faces, onto=True)
+
+    def mended(self) -> SurfaceMap:
+        """The map with its flipped triangles turned back, and its boundary put in order, where
+        that can be done; landmarks stay if that suffices. Figures are to be measured anew."""
+        s = self.source.surface
+        held = np.isin(s.source_vertex, self.landmarks[:, 0])
+        better = mended(s, self.image_uv, held=held, onto=True)
+        result = replace(
+            self, correction=Correction.between(self.image_uv, better, self.correction)
+        )
+        result.__dict__["image_uv"] = better  # inverses take seconds to find again
+        return result
 
     @cached_property
     def image(self) -> np.ndarray:
@@ -134,6 +160,7 @@ class SurfaceMap:
         save_surface(place / "source", self.source)
         save_surface(place / "target", self.target)
         tensors = {k: v.contiguous() for k, v in self.map.state_dict().items()}
+        tensors.update(self.correction.tensors())
         words = {
             "map": self.map.inner.config,  # type: ignore[union-attr]
             "landmarks": self.landmarks.tolist(),
@@ -153,6 +180,7 @@ def load_surface_map(folder: str | Path) -> SurfaceMap:
     tensors, words = read_pair(place / STEM, FORMAT, VERSION)
     source, target = load_surface(place / "source"), load_surface(place / "target")
     try:
+        correction = Correction.taken(tensors, len(source.surface.vertices))
         h = Rotated(build_planar(words["map"]), torch.eye(2))
         h.load_state_dict(tensors)
         landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, 2)
@@ -160,7 +188,7 @@ def load_surface_map(folder: str | Path) -> SurfaceMap:
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise misfit(place / STEM, error) from error
     h.eval().requires_grad_(False)
-    return SurfaceMap(source, target, h, landmarks, metrics, config)
+    return SurfaceMap(source, target, h, landmarks, metrics, config, correction)
 
 
 def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.predicates import orientation
 
 DOMAINS = ("disc", "square")
 # slim_held: SLIM without the sliding steps after it, a quick look at what slim would give
@@ -504,8 +505,8 @@ def boundary_self_intersections(uv: np.ndarray, loop: np.ndarray) -> int:
     n = len(p)
     side = q - p
     following = np.roll(side, -1, axis=0)
-    cross = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
-    folded = (np.abs(cross) < 1e-15) & ((side * following).sum(axis=1) < 0)
+    straight = orientation(p, q, np.roll(q, -1, axis=0)) == 0
+    folded = straight & ((side * following).sum(axis=1) <= 0)
     total = int(folded.sum())
     low, high = np.minimum(p, q), np.maximum(p, q)
     for i in range(n - 2):
@@ -514,15 +515,10 @@ def boundary_self_intersections(uv: np.ndarray, loop: np.ndarray) -> int:
         j = j[((low[j] <= high[i]) & (high[j] >= low[i])).all(axis=1)]
         if len(j) == 0:
             continue
-        d1, d2 = _turn(p[i], q[i], p[j]), _turn(p[i], q[i], q[j])
-        d3, d4 = _turn(p[j], q[j], p[i]), _turn(p[j], q[j], q[i])
+        d1, d2 = orientation(p[i], q[i], p[j]), orientation(p[i], q[i], q[j])
+        d3, d4 = orientation(p[j], q[j], p[i]), orientation(p[j], q[j], q[i])
         total += int(((d1 * d2 <= 0) & (d3 * d4 <= 0)).sum())
     return total
-
-
-def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    u, v = b - a, c - a
-    return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
 
 def symmetric_dirichlet_per_face(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytorch_lightning as pl
@@ -12,6 +12,7 @@ from torch import Tensor
 from nsm.energies import blend, landmark
 from nsm.tasks.optimizers import configure
 from nsm.tasks.rim import rim
+from nsm.tasks.weakest import carefully, stronger
 
 BOUNDARIES = ("exact", "penalty")
 LANDMARKS = ("augmented", "fixed")
@@ -132,6 +133,14 @@ class ConstrainedMap(pl.LightningModule):
             with torch.no_grad():
                 off = self(self.points) - self.targets
                 self.multipliers += 2 * held.lambda_landmarks * off
+
+    def strengthen(self, steps: int) -> None:
+        """Set up for a further training of what is nearly there: all demands in full, those on
+        triangles tenfold and on more of them, in small steps."""
+        held = self.constraints
+        self.constraints = replace(held, lambda_triangles=stronger(held.lambda_triangles))
+        self.ramp_steps = 0.0
+        carefully(self, steps)
 
     def log_validation(self, distortion: Tensor, determinant: Tensor, count: int) -> None:
         """Log what is followed on held-out points: mean energy, and the share of folds."""

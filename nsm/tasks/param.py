@@ -12,7 +12,7 @@ from nsm.data import Samples
 from nsm.energies import blend, first_fundamental_form, injectivity
 from nsm.maps import build_planar
 from nsm.tasks.optimizers import configure
-from nsm.tasks.weakest import Weakest
+from nsm.tasks.weakest import Weakest, carefully, stronger
 
 BOUNDARIES = ("free", "fixed")
 
@@ -89,6 +89,11 @@ class Param(pl.LightningModule):
         _, jacobian = self.map.value_and_jacobian(uv)
         energy = self.energy(source, first_fundamental_form(jacobian)).mean()
         return energy, torch.linalg.det(jacobian)
+
+    def strengthen(self, steps: int) -> None:
+        """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
+        self.lambda_triangles = stronger(self.lambda_triangles)
+        carefully(self, steps)
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         distortion, determinant = self._distortion(batch.uv)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
@@ -38,8 +39,13 @@ class Weakest(nn.Module):
         self.register_buffer("faces", faces, persistent=False)
         double = _double_areas(uv[faces]) if areas is None else 2 * areas
         self.register_buffer("area", double.clamp(min=1e-12), persistent=False)
+        self.watch(_COUNT)
+
+    def watch(self, count: int) -> None:
+        """Hold so many triangles open at once."""
         # in the state, so that resumed training goes on with the same ones
-        self.register_buffer("chosen", torch.arange(min(_COUNT, len(faces))))
+        chosen = torch.arange(min(count, len(self.faces)), device=self.faces.device)
+        self.register_buffer("chosen", chosen)
 
     def forward(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
         """Mean ``unfold`` over the weakest triangles under h: a scalar."""
@@ -74,3 +80,22 @@ def _double_areas(corners: Tensor) -> Tensor:
     a, b, c = corners.unbind(dim=1)
     u, v = b - a, c - a
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+
+
+def stronger(weight: float) -> float:
+    """λ_triangles for a further training: tenfold, and not zero."""
+    return max(10 * weight, 100.0)
+
+
+def carefully(module: pl.LightningModule, steps: int) -> None:
+    """Watch four times as many triangles, and train at a tenth of the rates for so many steps."""
+    for part in module.modules():
+        if isinstance(part, Weakest):
+            part.watch(4 * part.chosen.shape[-1])
+    optimizer = module.hparams["optimizer"]
+    for rate in ("lr", "encoding_lr"):
+        if optimizer.get(rate) is not None:
+            optimizer[rate] *= 0.1
+    scheduler = module.hparams["scheduler"]
+    scheduler["warmup"] = min(scheduler.get("warmup", 0), steps // 10)
+    module.hparams["max_steps"] = steps

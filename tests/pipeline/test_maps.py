@@ -11,6 +11,7 @@ import nsm
 from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline.inputs import landmark_vertices
+from nsm.results.metrics import evaluate
 from nsm.surfaces.geometry import point_mesh_distance
 from nsm.surfaces.together import Mesh
 
@@ -187,8 +188,6 @@ def test_analytic_targets_and_no_landmarks(here, domain):
 def test_penalties_keep_the_corners_of_the_square_as_key_points(on_the_square):
     f = on_the_square
     corners = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
-    from nsm.results.metrics import evaluate
-
     moved = evaluate(f.map, corners)
     off = np.linalg.norm(moved[:, None] - corners[None], axis=2).min(axis=1)
     assert off.max() < 0.05
@@ -259,14 +258,18 @@ def test_a_collection_maps_every_surface_to_every_other(trio):
     for figures in trio.metrics["pairs"].values():
         assert figures["flipped_percent"] == 0
         assert figures["symmetric_dirichlet_median"] < 6
-    assert trio.metrics["cycle_error_mean_percent"] < 0.05
+    assert trio.metrics["cycle_error_networks_mean_percent"] < 0.01
+    assert trio.metrics["cycle_error_mean_percent"] < 0.2
 
 
 def test_the_maps_of_a_collection_are_inverse_to_each_other(trio):
     there, back = trio.pair(0, 2), trio.pair(2, 0)
     points = trio.surfaces[0].in_original_units(trio.surfaces[0].surface.vertices[::5])
     again = back(there(points))
-    assert np.median(np.linalg.norm(again - points, axis=1)) < 1e-4
+    # linear on triangles there and back: inverse up to the size of these
+    assert np.median(np.linalg.norm(again - points, axis=1)) < 3e-3
+    uv = trio.surfaces[0].surface.uv
+    assert np.median(np.abs(evaluate(back.map, evaluate(there.map, uv)) - uv)) < 1e-6
 
 
 def test_a_collection_is_given_back(trio, tmp_path):

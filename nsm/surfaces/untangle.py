@@ -1,0 +1,209 @@
+"""Flat meshes whose few flipped triangles are turned back by moving the vertices around them.
+
+The energy is that of Garanzha et al. 2021 ("Foldover-free maps in 50 lines of code"): distortion
+over a smoothed determinant, which is finite on flipped triangles and drives their areas up until
+all are positive. It is minimised around each flip alone, over as many rings of triangles as it
+takes; the rest of the mesh stays as it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import isotonic_regression, minimize
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from nsm.surfaces.parameterization import at_fractions, fractions_of
+from nsm.surfaces.predicates import orientation
+
+_RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
+_ROUNDS, _ITERATIONS = 20, 100
+# of the area that a triangle should have: what is smaller could flip by the next rounding
+_ROOM = 1e-6
+# of the distance that two neighbours on the boundary have before the map: kept after it
+_GAP = 0.02
+
+
+def flipped(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Mask (F,) of the triangles of a flat mesh (V, 2) that are not counter-clockwise, exactly."""
+    a, b, c = (uv[faces[:, k]] for k in range(3))
+    return orientation(a, b, c) <= 0
+
+
+def order_violations(points: np.ndarray) -> int:
+    """How often a closed polygon (B, 2) fails to go once around the origin, counter-clockwise.
+
+    Zero, by exact signs, means that each side is seen counter-clockwise from the origin and that
+    the turns add up to one: the polygon is then star-shaped, so it does not cross itself.
+    """
+    following = np.roll(points, -1, axis=0)
+    backward = orientation(points, following, np.zeros(2)) <= 0
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    turns = np.mod(np.roll(angle, -1) - angle, 2 * np.pi)[~backward].sum() / (2 * np.pi)
+    return int(backward.sum()) or abs(round(turns) - 1)
+
+
+def untangled(
+    rest: np.ndarray, faces: np.ndarray, image: np.ndarray, fixed: np.ndarray
+) -> np.ndarray:
+    """The image of a flat mesh, with its flipped triangles turned back where that can be done.
+
+    Args:
+        rest: (V, 2) the mesh before it is mapped, no triangle of it flipped.
+        faces: (F, 3).
+        image: (V, 2) where the map sends its vertices.
+        fixed: (V,) mask of vertices that may not move.
+
+    Returns:
+        (V, 2): ``image``, but for vertices near a flip, which are as near as can be to where the
+        local affine map has them. Flips that remain are for the caller to count.
+    """
+    image = np.array(image, dtype=np.float64)
+    for rings in _RINGS:
+        bad = flipped(image, faces)
+        if not bad.any():
+            break
+        near = np.zeros(len(image), dtype=bool)
+        near[faces[bad]] = True
+        for _ in range(rings - 1):
+            near[faces[near[faces].any(axis=1)]] = True
+        for patch in _patches(faces, near & ~fixed, bad):
+            _solve(rest, patch, image, ~fixed & near)
+        if near.all():
+            break
+    return image
+
+
+def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.ndarray]:
+    """The faces (P, 3) around each group of free vertices that hang together, with a flip each."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    edges = edges[free[edges].all(axis=1)]
+    edges = np.concatenate([edges, faces[:, [2, 0]][free[faces[:, [2, 0]]].all(axis=1)]])
+    n = len(free)
+    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    label = np.where(free, connected_components(graph, directed=False)[1], -1)
+    of_face = label[faces].max(axis=1)  # the free vertices of a face are all in one group
+    wanted = np.unique(of_face[bad])
+    return [faces[of_face == group] for group in wanted[wanted >= 0].tolist()]
+
+
+def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndarray) -> None:
+    """Move free vertices of a patch (P, 3) within ``image``, if that leaves none of it flipped."""
+    vertices = np.unique(faces)
+    affine = _affine_fit(rest[vertices], image[vertices])
+    if affine is None:
+        return
+    a, b, c = (rest[faces[:, k]] @ affine.T for k in range(3))
+    shape = np.stack([b - a, c - a], axis=2)
+    with np.errstate(all="ignore"):
+        area = np.linalg.det(shape)
+        if not (area > 0).all():
+            return
+        inverse = np.linalg.inv(shape)
+    moving = vertices[free[vertices]]
+    trial = image.copy()
+
+    def determinants() -> np.ndarray:
+        p, q, r = (trial[faces[:, k]] for k in range(3))
+        return np.linalg.det(np.stack([q - p, r - p], axis=2)) / area
+
+    least = determinants().min()
+    for _ in range(_ROUNDS):
+        # Escobar et al. 2003: enough smoothing to pull at the worst, and less as it gets better
+        epsilon = np.sqrt(1e-12 + 0.04 * min(least, 0.0) ** 2)
+
+        def energy(x: np.ndarray, epsilon: float = epsilon) -> tuple[float, np.ndarray]:
+            trial[moving] = x.reshape(-1, 2)
+            value, force = _energy(trial, faces, inverse, epsilon)
+            return value, force[moving].ravel()
+
+        found = minimize(
+            energy,
+            trial[moving].ravel(),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": _ITERATIONS, "maxcor": 20},
+        )
+        if not np.isfinite(found.x).all():
+            return
+        trial[moving] = found.x.reshape(-1, 2)
+        least = determinants().min()
+        if least > _ROOM and not flipped(trial, faces).any():
+            image[moving] = trial[moving]
+            return
+
+
+def _affine_fit(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
+    """The matrix (2, 2) that best takes points (N, 2) to others, if it keeps the orientation."""
+    x, y = before - before.mean(axis=0), after - after.mean(axis=0)
+    matrix = np.linalg.lstsq(x, y, rcond=None)[0].T
+    return matrix if np.linalg.det(matrix) > 0 else None
+
+
+def _energy(
+    points: np.ndarray, faces: np.ndarray, inverse: np.ndarray, epsilon: float
+) -> tuple[float, np.ndarray]:
+    """Σ (‖J‖² + det² + 1) / χ(det) over the triangles, and its gradient (V, 2).
+
+    χ(d) = (d + √(ε² + d²)) / 2 is positive, whatever d is.
+    """
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    jacobian = np.stack([b - a, c - a], axis=2) @ inverse
+    d = np.linalg.det(jacobian)
+    root = np.sqrt(epsilon**2 + d**2)
+    # for d < 0 the difference would cancel
+    chi = np.where(d > 0, 0.5 * (d + root), 0.5 * epsilon**2 / (root - np.minimum(d, 0)))
+    slope = chi / root
+    top = (jacobian**2).sum(axis=(1, 2)) + d**2 + 1
+    cofactor = np.stack(
+        [
+            np.stack([jacobian[:, 1, 1], -jacobian[:, 1, 0]], axis=1),
+            np.stack([-jacobian[:, 0, 1], jacobian[:, 0, 0]], axis=1),
+        ],
+        axis=1,
+    )
+    by_d = (2 * d - top * slope / chi) / chi
+    force = 2 * jacobian / chi[:, None, None] + by_d[:, None, None] * cofactor
+    edges = force @ inverse.transpose(0, 2, 1)  # columns: by b - a and by c - a
+    gradient = np.zeros_like(points)
+    np.add.at(gradient, faces[:, 1], edges[:, :, 0])
+    np.add.at(gradient, faces[:, 2], edges[:, :, 1])
+    np.add.at(gradient, faces[:, 0], -edges.sum(axis=2))
+    return float((top / chi).sum()), gradient
+
+
+def in_order(points: np.ndarray, rest: np.ndarray, domain: str) -> np.ndarray:
+    """Points of ∂Ω (B, 2), moved along it into the order of a loop where they are not.
+
+    The nearest increasing fractions of the way around ∂Ω (isotonic regression) take their place,
+    at distances of at least a small share of what they are before the map.
+
+    Args:
+        points: where a map sends the loop's vertices, which should go around Ω once.
+        rest: (B, 2) where they are before, in order.
+        domain: ``disc`` or ``square``.
+
+    Returns:
+        (B, 2); equal to ``points`` where these do not go around once, which no small change mends.
+    """
+    before, now = fractions_of(rest, domain), fractions_of(points, domain)
+    gap = _GAP * np.mod(np.roll(before, -1) - before, 1.0)
+    step = np.mod(np.roll(now, -1) - now + 0.5, 1.0) - 0.5
+    if round(step.sum()) != 1:
+        return points
+    # how far around each point is, less the gaps: what should not decrease; over three turns
+    turn = 1.0 - gap.sum()
+    once = np.concatenate([[0.0], np.cumsum(step - gap)[:-1]])
+    along = np.concatenate([once - turn, once, once + turn])
+    # the circle is opened at a point that all points before it are behind, and all after it ahead
+    highest = np.maximum.accumulate(along)
+    lowest = np.minimum.accumulate(along[::-1])[::-1]
+    n = len(now)
+    first = int(np.argmin((highest - lowest)[n : 2 * n]))
+    piece = along[n + first : 2 * n + first]
+    better = isotonic_regression(piece).x.clip(piece[0], piece[0] + turn)
+    index = (first + np.flatnonzero(better != piece)) % n
+    result = points.copy()
+    shift = (better - piece)[better != piece]
+    result[index] = at_fractions(np.mod(now[index] + shift, 1.0), domain)
+    return result

@@ -1,0 +1,61 @@
+"""Maps that a training leaves folded: repaired, or told as such."""
+
+import json
+
+import numpy as np
+import pytest
+
+import nsm
+from nsm.pipeline import guarantee
+from nsm.results import analytic
+from nsm.results.analytic import analytic_surface
+
+QUICK = ["experiment=quick", "data.held_out=512", "trainer.threads=1"]
+
+CROSSED = [[0.5, 0.0], [-0.5, 0.1], [0.0, 0.5], [0.1, -0.6]]  # swapped in pairs: a half turn inside
+FORCED = ["constraints.ramp=0", "constraints.lambda_triangles=0", "constraints.lambda_seam=0"]
+FORCED += ["constraints.lambda_injectivity=0", "constraints.lambda_landmarks=1.0e+4"]
+FORCED += ["trainer.gradient_clip=null", "optimizer.lr=0.01", "trainer.max_steps=80"]
+
+
+@pytest.fixture
+def ends(monkeypatch):
+    monkeypatch.setattr(analytic, "_RINGS", 12)
+    return [analytic_surface({"name": name}, "disc") for name in ("plane", "paraboloid")]
+
+
+def forced(ends, folder, *words):
+    """A map that its few steps leave folded, and what metrics.json says of it."""
+    uv = ends[0].surface.uv
+    ids = [int(np.linalg.norm(uv - p, axis=1).argmin()) for p in CROSSED]
+    pairs = [[ids[k], ids[j]] for k, j in enumerate((1, 0, 2, 3))]
+    f = nsm.map_pair(
+        *ends,
+        pairs,
+        overrides=[*QUICK, *FORCED, "artefacts=false", "logger=none", *words],
+        folder=folder,
+        progress=False,
+    )
+    return f, json.loads((folder / "metrics.json").read_text())
+
+
+def test_a_map_that_flips_is_repaired_and_says_so(ends, tmp_path, capsys):
+    _, told = forced(ends, tmp_path / "plain", "guarantee.repair=false")
+    assert told["certified"] is False and told["flipped_triangles"] > 0
+    assert told["flipped_triangles"] == told["before_repair"]["flipped_triangles"]
+    assert "NOT certified" in capsys.readouterr().out
+    f, mended = forced(ends, tmp_path / "mended")
+    assert mended["certified"] is True and mended["flipped_triangles"] == 0
+    assert mended["before_repair"] == told["before_repair"]
+    assert f.metrics["flipped_percent"] == 0 and f.metrics["certified"] is True
+    assert nsm.load(tmp_path / "mended").certificate["certified"]
+
+
+def test_where_moving_vertices_is_not_enough_training_goes_on(ends, tmp_path, monkeypatch):
+    monkeypatch.setattr(nsm.SurfaceMap, "mended", lambda self: self)
+    monkeypatch.setattr(guarantee, "_SHARE", 1)  # as many steps again
+    _, short = forced(ends, tmp_path / "short", "guarantee.rounds=0")
+    _, long = forced(ends, tmp_path / "long", "guarantee.rounds=2")
+    assert short["rounds"] == 0 and not short["certified"]
+    assert 1 <= long["rounds"] <= 2
+    assert long["flipped_triangles"] < long["before_repair"]["flipped_triangles"]

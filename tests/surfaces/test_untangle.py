@@ -1,0 +1,135 @@
+"""Flipped triangles found with exact signs, and turned back."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nsm.surfaces.predicates import orientation
+from nsm.surfaces.shapes import grid_mesh, ring_mesh
+from nsm.surfaces.topology import boundary_loops
+from nsm.surfaces.untangle import flipped, in_order, order_violations, untangled
+
+DISC, DISC_FACES = ring_mesh(10)
+SQUARE, SQUARE_FACES = grid_mesh(12)
+finite = st.floats(-1e100, 1e100, allow_subnormal=True)
+
+
+def exact(a, b, c):
+    (ax, ay), (bx, by), (cx, cy) = ([Fraction(x) for x in p] for p in (a, b, c))
+    return np.sign(float((bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0)) - float(
+        (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) < 0
+    )
+
+
+@given(st.lists(finite, min_size=6, max_size=6))
+@settings(max_examples=100, deadline=None)
+def test_signs_of_areas_are_exact(x):
+    a, b, c = x[:2], x[2:4], x[4:]
+    assert orientation([a], [b], [c])[0] == exact(a, b, c)
+
+
+@given(st.integers(-50, 50), st.integers(-50, 50), st.integers(0, 2))
+@settings(max_examples=100, deadline=None)
+def test_signs_are_exact_next_to_a_line(i, j, which):
+    """Points a few roundings off the diagonal, where the rounded determinant often errs."""
+    x = [[0.5 + i * 2.0**-53, 0.5 + j * 2.0**-53], [12.0, 12.0], [24.0, 24.0]]
+    a, b, c = x[which:] + x[:which]
+    assert orientation([a], [b], [c])[0] == exact(a, b, c)
+
+
+def test_what_is_not_finite_has_no_orientation():
+    assert orientation([[0, 0], [0, np.nan]], [1, 0], [[np.inf, 1], [0, 1]]).tolist() == [0, 0]
+
+
+def rim_of(uv, faces):
+    fixed = np.zeros(len(uv), dtype=bool)
+    fixed[boundary_loops(faces)[0]] = True
+    return fixed
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(0.0, 1.0),
+    st.floats(0.02, 0.2),
+    st.sampled_from([(DISC, DISC_FACES), (SQUARE, SQUARE_FACES)]),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_tangled_mesh_is_untangled_whatever_the_tangle(seed, share, size, mesh):
+    rest, faces = mesh
+    random = np.random.default_rng(seed)
+    fixed = rim_of(rest, faces)
+    tangled = np.where(
+        (~fixed & (random.random(len(rest)) < share))[:, None],
+        rest + size * random.normal(size=rest.shape),
+        rest,
+    )
+    before = tangled.copy()
+    result = untangled(rest, faces, tangled, fixed)
+    assert (tangled == before).all()
+    a, b, c = (result[faces[:, k]] for k in range(3))
+    areas = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    assert (areas > 0).all() and areas.sum() == pytest.approx(
+        2 * (4 if rest is SQUARE else areas.sum() / 2)
+    )
+    assert (result[fixed] == rest[fixed]).all()
+
+
+def test_only_what_lies_around_a_flip_is_moved():
+    center = int(np.linalg.norm(DISC - [0.3, 0.2], axis=1).argmin())
+    tangled = DISC.copy()
+    tangled[center] += [0.25, 0.0]
+    assert flipped(tangled, DISC_FACES).any()
+    result = untangled(DISC, DISC_FACES, tangled, rim_of(DISC, DISC_FACES))
+    moved = np.flatnonzero((result != tangled).any(axis=1))
+    assert not flipped(result, DISC_FACES).any()
+    assert 0 < len(moved) < 20
+    assert np.linalg.norm(DISC[moved] - DISC[center], axis=1).max() < 0.5
+
+
+def test_a_mesh_without_flips_is_left_alone():
+    image = DISC @ np.array([[0.8, 0.3], [-0.1, 1.2]])
+    assert (untangled(DISC, DISC_FACES, image, rim_of(DISC, DISC_FACES)) == image).all()
+
+
+def test_what_cannot_be_untangled_is_given_back_for_the_caller_to_count():
+    mirrored = DISC * [1.0, -1.0]
+    result = untangled(DISC, DISC_FACES, mirrored, np.ones(len(DISC), dtype=bool))
+    assert (result == mirrored).all() and flipped(result, DISC_FACES).all()
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.15), st.sampled_from(["disc", "square"]))
+@settings(max_examples=50, deadline=None)
+def test_a_boundary_is_put_in_order_along_the_domain(seed, size, domain):
+    random = np.random.default_rng(seed)
+    t = np.arange(40) / 40
+    from nsm.surfaces.parameterization import at_fractions, fractions_of
+
+    rest = at_fractions(t, domain)
+    jumbled = at_fractions(np.mod(t + 0.3 + size * (random.random(40) - 0.5), 1), domain)
+    result = in_order(jumbled, rest, domain)
+    steps = np.mod(np.diff(fractions_of(result, domain), append=fractions_of(result, domain)[0]), 1)
+    assert (steps > 0).all() and steps.sum() == pytest.approx(1)
+    if order_violations(jumbled) == 0:
+        assert (result == jumbled).all()
+    if domain == "disc":
+        assert order_violations(result) == 0
+    # no point goes farther than the jumble went
+    assert np.linalg.norm(result - jumbled, axis=1).max() <= 8 * size + 1e-9
+
+
+def test_order_is_violated_by_steps_back_double_turns_and_the_wrong_way():
+    t = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = np.stack([np.cos(t), np.sin(t)], axis=1)
+    assert order_violations(circle) == 0
+    assert order_violations(circle[::-1]) == 24
+    twice = np.concatenate([circle, circle])
+    assert order_violations(twice) == 1
+    swapped = circle.copy()
+    swapped[[3, 4]] = swapped[[4, 3]]
+    assert order_violations(swapped) == 1
+    stalled = circle.copy()
+    stalled[3] = stalled[4]
+    assert order_violations(stalled) == 1
