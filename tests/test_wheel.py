@@ -54,3 +54,12 @@ def test_it_runs_from_another_folder(installed, tmp_path):
     )
     assert result.returncode == 0, result.stderr
     assert len(list((tmp_path / "outputs" / "overfit").glob("hemisphere-*/metrics.json"))) == 1
+    report = subprocess.run(
+        [installed, "-m", "nsm.cli", "report", "outputs"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert report.returncode == 0, report.stderr
+    assert (tmp_path / "report.html").stat().st_size > 1_000_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -110,15 +111,24 @@ def _differing(runs: Sequence[Run]) -> list[str]:
 
 def _labels(runs: Sequence[Run], differing: Sequence[str]) -> list[str]:
     """A short name for each run: the settings that differ, or its path where they do not tell."""
+    chosen = {key.removesuffix(".name") for key in differing if key.endswith(".name")}
+    last = Counter(key.rsplit(".", 1)[-1] for key in differing)
+
+    def called(key: str) -> str:
+        plain = key.removesuffix(".name")
+        end = plain.rsplit(".", 1)[-1]
+        return end if last[end] == 1 else plain
+
     labels = []
     for run in runs:
-        own = [key for key in differing if run.settings.get(key) is not None]
-        # the choice of a group says more than the parameters that come with it
-        own.sort(key=lambda key: not key.endswith(".name"))
-        words = [
-            f"{key.removesuffix('.name')}={_brief(run.settings[key])}"
-            for key in own[:_LABEL_SETTINGS]
+        # the choice of a group says enough of the parameters that come with it
+        own = [
+            key
+            for key in differing
+            if isinstance(run.settings.get(key), (str, int, float))
+            and (key.endswith(".name") or key.rsplit(".", 1)[0] not in chosen)
         ]
+        words = [f"{called(key)}={_brief(run.settings[key])}" for key in own[:_LABEL_SETTINGS]]
         labels.append(", ".join(words))
     if len(set(labels)) < len(labels) or not all(labels):
         return [run.name for run in runs]

@@ -192,7 +192,7 @@
     return {
       paper_bgcolor: "transparent", plot_bgcolor: "transparent",
       font: { color: colour("ink"), family: "system-ui, sans-serif", size: 12 },
-      margin: { l: 60, r: 10, t: 10, b: 45 }, hovermode: "closest",
+      margin: { l: 60, r: 10, t: 32, b: 45 }, hovermode: "closest",
       modebar: { bgcolor: "transparent", color: colour("faint"), activecolor: colour("accent") },
       hoverlabel: { namelength: -1 }, legend: { itemclick: false, itemdoubleclick: false },
       showlegend: true, xaxis: { ...axis, ...x }, yaxis: { ...axis, ...y },
@@ -307,6 +307,8 @@
       const every = (values, k) => values.filter((_, index) => index % 3 === k);
       const [x, y, z] = [0, 1, 2].map((k) => every(points, k));
       const [i, j, k] = [0, 1, 2].map((m) => every(corners, m));
+      const extent = [x, y, z].map((along) => along.reduce((a, b) => Math.max(a, b), -Infinity) - along.reduce((a, b) => Math.min(a, b), Infinity));
+      const [ax, ay, az] = extent.map((length) => Math.max(length / Math.max(...extent), 0.01));
       const values = shape.colours[choices.colour];
       const paint = values
         ? {
@@ -327,9 +329,9 @@
           modebar: { bgcolor: "transparent", color: look("faint"), activecolor: look("accent") },
           paper_bgcolor: "transparent", margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: task.name + choices.shape,
           scene: {
-            xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "data", bgcolor: "transparent",
+            xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "manual", aspectratio: { x: ax, y: ay, z: az }, bgcolor: "transparent",
             uirevision: task.name + choices.shape,
-            camera: { up: { x: ux, y: uy, z: uz }, eye: { x: 1.8 * tx, y: 1.8 * ty, z: 1.8 * tz } },
+            camera: { up: { x: ux, y: uy, z: uz }, eye: { x: 1.3 * tx, y: 1.3 * ty, z: 1.3 * tz } },
           },
         }, CONFIG);
       if (!panes[n].bound) {
