@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench bench-maps clean
+.PHONY: demo test check bench bench-maps bench-activation clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -22,6 +22,10 @@ bench: .venv/.nsm-dev
 # Maps between the meshes of the folder MESHES, and flattening beside libigl's: over an hour.
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
+
+# Each activation in one network, its wrinkles, and a report on the runs: half an hour.
+bench-activation: .venv/.nsm-dev
+	$(BIN)/python benchmarks/activation.py $(if $(MESHES),--meshes $(MESHES))
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
