@@ -104,6 +104,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "boundary_self_intersections": ("overlaps of the boundary", ""),
     "cycle_error_mean_percent": ("cycle error, mean", "% of diagonal"),
     "cycle_error_max_percent": ("cycle error, largest", "% of diagonal"),
+    "certified": ("certified injective", ""),
     "steps": ("steps", ""),
     "seconds": ("time", "s"),
 }

@@ -23,7 +23,7 @@ _HISTOGRAMS = ("symmetric dirichlet", "singular value ratio", "area")
 _LABEL_SETTINGS = 3  # a run is called by at most so many of the settings that differ
 _HIGHER_IS_BETTER = ("covered_percent",)
 _ZERO_IS_BEST = ("normal_variation_excess_degrees",)
-_NEITHER = ("steps",)
+_NEITHER = ("steps", "certified")
 
 
 class _Arrays:

@@ -13,6 +13,8 @@ from omegaconf import OmegaConf
 
 from nsm.errors import NsmError
 
+Figure = float | str | None
+
 # settings that change nothing in a result
 _INCIDENTAL = ("resume", "logger", "artefacts", "trainer.progress")
 
@@ -26,14 +28,14 @@ class Run:
         name: its path below the folder in which it was found.
         task: overfit, param, ...
         settings: "group.key" to value.
-        figures: name to number; None for one that is not finite.
+        figures: name to number, yes or no; None for a number that is not finite.
     """
 
     folder: Path
     name: str
     task: str
     settings: dict[str, Any]
-    figures: dict[str, float | None]
+    figures: dict[str, Figure]
 
 
 @dataclass(frozen=True)
@@ -116,43 +118,54 @@ def _flat(words: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield name, value
 
 
-def _figures(words: Any) -> dict[str, float | None]:
-    """Numbers of metrics.json by one name each.
+def _figures(words: Any) -> dict[str, Figure]:
+    """Figures of metrics.json by one name each.
 
     Of ``task=param`` those of nsm have plain names, those of a collection's pairs their mean.
     """
     if not isinstance(words, Mapping) or not isinstance(words.get("metrics"), Mapping):
         raise ValueError("no figures in it")
-    figures: dict[str, float | None] = {}
-    for key in ("steps", "seconds"):
-        if key in words:
-            figures[key] = _number(words[key])
-    aside: dict[str, float | None] = {}
+    figures = _numbers({key: words[key] for key in ("steps", "seconds") if key in words})
+    aside: dict[str, Figure] = {}
     for key, value in words["metrics"].items():
         if key == "nsm" and isinstance(value, Mapping):
-            figures.update({k: _number(v) for k, v in value.items()})
+            figures.update(_numbers(value))
         elif key == "pairs" and isinstance(value, Mapping):
-            for name in next(iter(value.values()), {}):
-                of_pairs = [_number(pair.get(name)) for pair in value.values()]
-                known = [number for number in of_pairs if number is not None]
-                figures[name] = sum(known) / len(known) if len(known) == len(of_pairs) else None
-                aside.update(
-                    {f"{pair}: {name}": n for pair, n in zip(value, of_pairs, strict=True)}
-                )
+            pairs = {name: _numbers(of_pair) for name, of_pair in value.items()}
+            figures.update(_means(list(pairs.values())))
+            aside.update({f"{name}: {k}": v for name, own in pairs.items() for k, v in own.items()})
         elif isinstance(value, Mapping):
-            aside.update({f"{key}: {k}": _number(v) for k, v in value.items()})
+            aside.update({f"{key}: {k}": v for k, v in _numbers(value).items()})
         else:
-            figures[key] = _number(value)
+            figures.update(_numbers({key: value}))
     return {**figures, **aside}
 
 
-def _number(value: Any) -> float | None:
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{str(value)[:40]!r} is not a number")
-    # JSON of other writers may hold NaN
-    return value if abs(value) < float("inf") else None
+def _numbers(words: Mapping[str, Any]) -> dict[str, Figure]:
+    """What of words can stand in a table: numbers, and yes or no."""
+    result: dict[str, Figure] = {}
+    for key, value in words.items():
+        if isinstance(value, bool):
+            result[key] = "yes" if value else "no"
+        elif isinstance(value, (int, float)):
+            # JSON of other writers may hold NaN
+            result[key] = value if abs(value) < float("inf") else None
+        elif value is None:
+            result[key] = None
+    return result
+
+
+def _means(pairs: Sequence[Mapping[str, Figure]]) -> dict[str, Figure]:
+    """The mean of each figure that all pairs have; of yes and no, whether all say yes."""
+    result: dict[str, Figure] = {}
+    for key in pairs[0] if pairs else ():
+        values = [pair.get(key) for pair in pairs]
+        numbers = [value for value in values if isinstance(value, (int, float))]
+        if all(value in ("yes", "no") for value in values):
+            result[key] = "yes" if all(value == "yes" for value in values) else "no"
+        else:
+            result[key] = sum(numbers) / len(numbers) if len(numbers) == len(values) else None
+    return result
 
 
 def _short(error: Exception) -> str:
