@@ -33,6 +33,12 @@ def _run(config: DictConfig) -> bool:
     except NsmError as error:
         _say(str(error))
         return False
+    except MemoryError:
+        _say("not enough memory; give a smaller mesh, network or data.batch_size")
+        return False
+    except OSError as error:  # a disk that is full or read-only, a folder that may not be written
+        _say(_of_disk(error))
+        return False
     finally:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()  # nothing came of it: leave no empty folder behind
@@ -76,12 +82,23 @@ def _tasks() -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
+    except OSError as error:  # Hydra makes the run folder before anything of ours runs
+        _say(_of_disk(error))
+        sys.exit(2)
     if not all(results):
         sys.exit(2)
 
 
+def _of_disk(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename else ""
+    reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
+    return f"{place}{reason}; choose another folder with hydra.run.dir=FOLDER, or make room"
+
+
 def _say(message: str) -> None:
-    print(f"nsm: {message}", file=sys.stderr)
+    """One line, whatever is in the names that it tells."""
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    print(f"nsm: {line}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -135,6 +136,10 @@ _POSITIVE = (
 )
 
 
+_LARGEST_CONFIG = 1_000_000  # bytes
+_LONGEST_NAME = 100  # of a run folder, without its time; file systems take 255 bytes
+
+
 def conf_folder() -> Path:
     """The configuration: inside an installed package, or beside it in a clone."""
     package = Path(__file__).parent
@@ -164,7 +169,7 @@ def _run_folder(
         what = "-".join(_called(surface) for surface in surfaces)
     elif target is not None:
         what = "-".join(_called(end) for end in (source, target))
-    folder = f"outputs/{task}/{what}-{stamp}"
+    folder = f"outputs/{task}/{what[:_LONGEST_NAME]}-{stamp}"
     number, free = 2, folder
     while Path(free).exists():  # runs started within the same second
         number, free = number + 1, f"{folder}-{number}"
@@ -205,6 +210,7 @@ def checked(config: DictConfig) -> DictConfig:
     except OmegaConfBaseException as error:
         raise NsmError(_misfit(error)) from error
     assert isinstance(typed, DictConfig)
+    _check_values("", OmegaConf.to_container(typed, resolve=False))
     missing = sorted(OmegaConf.missing_keys(typed))
     if missing:
         raise NsmError(f"setting {missing[0]}: missing; choose an option of its group or give it")
@@ -219,6 +225,62 @@ def checked(config: DictConfig) -> DictConfig:
     if typed.phi.overrides:
         compose_config(["task=overfit", *typed.phi.overrides])
     return typed
+
+
+def read_config(file: Path) -> DictConfig:
+    """A configuration that a run has stored.
+
+    It may come from a stranger: what a stored one never holds, because it is resolved, is refused
+    before it could be carried out: interpolations, which read the environment, tags, which name
+    Python objects, and aliases, which may repeat each other without end.
+
+    Raises:
+        NsmError: a file that cannot be read, or that holds such things.
+    """
+    try:
+        if file.stat().st_size > _LARGEST_CONFIG:
+            raise ValueError(f"larger than {_LARGEST_CONFIG} bytes")
+        text = file.read_text(encoding="utf-8")
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+                raise ValueError("anchors are not taken")
+            if getattr(event, "tag", None):
+                raise ValueError("tags are not taken")
+            if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
+                raise ValueError("interpolations are not taken")
+        stored = OmegaConf.create(text)
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise NsmError(f"{file}: not a configuration ({reason}); start the run again") from error
+    if not isinstance(stored, DictConfig):
+        raise NsmError(f"{file}: not a configuration; start the run again")
+    return stored
+
+
+def _check_values(key: str, value: Any) -> None:
+    """NsmError for what a value must not hold once it is resolved.
+
+    An interpolation that is left came out of another value, such as a file's name, and would be
+    resolved when it is next looked at. Nothing is made by ``_target_``: registries name what is.
+    """
+    if isinstance(value, dict):
+        for name, item in value.items():
+            if name == "_target_":
+                raise NsmError(
+                    f"setting {key or name}: '_target_' is not taken; things are made by the names "
+                    "that nsm --help lists"
+                )
+            _check_values(f"{key}.{name}" if key else str(name), item)
+    elif isinstance(value, list):
+        for item in value:
+            _check_values(key, item)
+    elif isinstance(value, str):
+        if "${" in value:
+            raise NsmError(f"setting {key}: '${{' is not taken in a value; rename the file")
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            raise NsmError(f"setting {key}: {value!r} is not UTF-8; rename the file") from None
 
 
 def _misfit(error: OmegaConfBaseException) -> str:

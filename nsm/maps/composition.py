@@ -57,7 +57,7 @@ class Rotated(nn.Module):
         if rotation.shape != (2, 2):
             raise ValueError(f"a rotation of the plane is (2, 2), not {tuple(rotation.shape)}")
         r = rotation.detach().double().cpu()
-        drift = (r.T @ r - torch.eye(2, dtype=r.dtype)).abs().max()
+        drift = (r.T @ r - torch.eye(2, dtype=r.dtype, device=r.device)).abs().max()
         if not (drift <= 1e-4 and torch.linalg.det(r) > 0):
             raise ValueError(f"not a rotation: {r.tolist()}")
         self.inner = inner

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from nsm.config import checked
+from nsm.config import checked, read_config
 from nsm.errors import NsmError
 from nsm.pipeline.collection_map import run_collection_map
 from nsm.pipeline.common import CONFIG_FILE, quiet_lightning
@@ -56,7 +56,4 @@ def _stored_config(folder: Path) -> DictConfig:
     file = folder / CONFIG_FILE
     if not file.is_file():
         raise NsmError(f"resume={folder}: no {CONFIG_FILE} there; give the folder of a run")
-    stored = OmegaConf.load(file)
-    if not isinstance(stored, DictConfig):
-        raise NsmError(f"{file}: not a configuration; start the run again")
-    return checked(stored)
+    return checked(read_config(file))

@@ -28,9 +28,12 @@ def read_attributes(
         if settings[key] is None:
             continue
         try:
-            values = np.load(settings[key], allow_pickle=False)
+            # mapped, so that a header that lies about the size makes no room for it
+            values = np.load(settings[key], mmap_mode="r", allow_pickle=False)
+            if not isinstance(values, np.ndarray):
+                raise ValueError("an archive of arrays")
             on_cut_mesh(surface, values)
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, OverflowError, SyntaxError) as error:
             reason = " ".join(str(error).split())[:160]
             raise NsmError(
                 f"attributes.{key}={settings[key]}: {reason}; give a .npy array with a row for "

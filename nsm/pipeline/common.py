@@ -22,7 +22,7 @@ from nsm.data import OverfitData
 from nsm.errors import NsmError
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
-from nsm.results.files import as_json
+from nsm.results.files import as_json, check_stored
 from nsm.results.progress import TrainingProgress
 from nsm.surfaces import Surface
 
@@ -192,6 +192,7 @@ def _fit(
         trainer.fit(module, datamodule=data)
         return
     try:
+        check_stored(checkpoint)
         torch.load(checkpoint, weights_only=True, map_location="cpu")
     except Exception as error:  # whatever a damaged or foreign file raises
         raise NsmError(

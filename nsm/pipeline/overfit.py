@@ -75,7 +75,7 @@ def run_overfit(
     Raises:
         NsmError: a mesh, setting or run folder that cannot be used.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     started = time.monotonic()
     if surface is None:
         surface = configured_surface(config)

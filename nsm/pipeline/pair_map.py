@@ -62,7 +62,7 @@ def run_pair_map(
     Raises:
         NsmError: a surface, landmark, setting or run folder that cannot be used.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     started = time.monotonic()
     for key in ("source", "target", "landmarks"):
         config[key] = absolute_paths(config[key])  # resuming works from any folder

@@ -49,7 +49,7 @@ def run_param(
     Raises:
         NsmError: a mesh, neural surface, setting or run folder that cannot be used.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     started = time.monotonic()
     if phi is None:
         phi = neural_surface(config, console)

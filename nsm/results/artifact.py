@@ -10,15 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nsm.errors import NsmError
 from nsm.maps import build_analytic, build_map
-from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
+from nsm.results.networks import network_of
 from nsm.surfaces import Surface
 
 FORMAT = "nsm-surface"
 VERSION = 1
 STEM = "surface"
+_MOST_VERTICES = 200_000_000  # of a mesh file
 _ARRAYS = ("vertices", "faces", "uv", "source_vertex", "twins", "center")
 
 
@@ -124,18 +125,22 @@ def load_surface(folder: str | Path) -> NeuralSurface:
             **arrays,
         )
         _check_shapes(surface)
-        network = _build(words["map"])
-        network.load_state_dict({k.removeprefix("map."): v for k, v in tensors.items()})
+        state = {k.removeprefix("map."): v for k, v in tensors.items()}
+        network = _network(words["map"], state)
         metrics, config = dict(words["metrics"]), dict(words["config"])
-    except (KeyError, TypeError, ValueError, RuntimeError, NsmError) as error:
+    except BROKEN as error:
         raise misfit(path / STEM, error) from error
     network.eval().requires_grad_(False)
     return NeuralSurface(surface, network, metrics, config)
 
 
-def _build(config: dict[str, Any]) -> nn.Module:
-    """A network, or the closed form of an analytic surface, from its configuration."""
-    return build_analytic(config) if "name" in config else build_map(config)
+def _network(config: dict[str, Any], state: dict[str, Tensor]) -> nn.Module:
+    """A network, or the closed form of an analytic surface, from its configuration and weights."""
+    if "name" in config:
+        return build_analytic(config)
+    if config.get("out_dim") != 3:
+        raise ValueError("the network is no map to space")
+    return network_of(build_map, config, state)
 
 
 def _check_shapes(surface: Surface) -> None:
@@ -145,6 +150,14 @@ def _check_shapes(surface: Surface) -> None:
     for name, shape in expected.items():
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
+    for name in _ARRAYS:
+        whole = name in ("faces", "source_vertex", "twins")
+        if getattr(surface, name).dtype != (np.int64 if whole else np.float64):
+            raise ValueError(f"{name} is not of its type")
+    if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
+        raise ValueError("no faces, or a vertex of the file below -1")
+    if not 0 <= surface.source_vertex.max() < _MOST_VERTICES:  # rows are made for each of them
+        raise ValueError("a vertex that no mesh file has")
     for name, columns in (("faces", 3), ("twins", 2)):
         index = getattr(surface, name)
         if index.ndim != 2 or index.shape[1] != columns:

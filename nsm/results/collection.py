@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import nn
 
-from nsm.maps import Between, Rotated, build_planar
+from nsm.maps import Between
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, together
-from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
+from nsm.results.networks import network_of
 from nsm.results.pair_metrics import pair_metrics
-from nsm.results.surface_map import SurfaceMap
+from nsm.results.surface_map import SurfaceMap, rotated_planar
 from nsm.surfaces.location import locate
 
 FORMAT = "nsm-collection"
@@ -118,7 +119,9 @@ def load_collection(folder: str | Path) -> SurfaceCollection:
     tensors, words = read_pair(place / STEM, FORMAT, VERSION)
     try:
         count = int(words["count"])
-    except (KeyError, TypeError, ValueError) as error:
+        if not 2 < count <= len(tensors):
+            raise ValueError(f"{count} surfaces")
+    except BROKEN as error:
         raise misfit(place / STEM, error) from error
     surfaces = [load_surface(place / f"surface_{k}") for k in range(count)]
     try:
@@ -129,15 +132,14 @@ def load_collection(folder: str | Path) -> SurfaceCollection:
                 corrections[i, j] = found
         maps: list[nn.Module] = []
         for k in range(count):
-            h = Rotated(build_planar(words["map"]), torch.eye(2))
             own = {
                 n.split(".", 1)[1]: v for n, v in tensors.items() if n.split(".", 1)[0] == str(k)
             }
-            h.load_state_dict(own)
+            h = network_of(rotated_planar, words["map"], own)
             maps.append(h.eval().requires_grad_(False))
         landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, count)
         metrics, config = dict(words["metrics"]), dict(words["config"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except BROKEN as error:
         raise misfit(place / STEM, error) from error
     return SurfaceCollection(surfaces, maps, landmarks, metrics, config, corrections)
 

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import tempfile
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,19 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from nsm.errors import NsmError
+
+# What the words and arrays of a damaged or forged artefact may raise while it is put together.
+BROKEN = (
+    KeyError,
+    TypeError,
+    ValueError,
+    RuntimeError,
+    AttributeError,
+    ArithmeticError,
+    IndexError,
+    MemoryError,
+    NsmError,
+)
 
 
 def atomic_write(path: str | Path, data: bytes) -> None:
@@ -98,9 +112,20 @@ def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], d
             f"one in {file.name}); copy the folder or make the run again"
         )
     try:
-        return load(data), words
-    except SafetensorError as error:
+        tensors = load(data)
+    except (SafetensorError, *BROKEN) as error:
         raise misfit(stem, error) from error
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise misfit(stem, ValueError(f"{name} is not finite"))
+    return tensors, words
+
+
+def check_stored(archive: Path) -> None:
+    """ValueError unless a zip archive keeps its members as they are, so that it cannot swell."""
+    with zipfile.ZipFile(archive) as members:
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members.infolist()):
+            raise ValueError("compressed members")
 
 
 def misfit(stem: Path, error: Exception) -> NsmError:

@@ -12,8 +12,9 @@ import numpy as np
 from nsm.maps import Planar, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, mended
-from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
+from nsm.results.networks import network_of
 from nsm.surfaces.location import locate
 
 FORMAT = "nsm-parameterization"
@@ -90,10 +91,9 @@ def load_parameterization(folder: str | Path) -> Parameterization:
     tensors, words = read_pair(stem, FORMAT, VERSION)
     try:
         correction = Correction.taken(tensors, len(phi.surface.vertices))
-        planar = build_planar(words["map"])
-        planar.load_state_dict(tensors)
+        planar = network_of(build_planar, words["map"], tensors)
         metrics, config = dict(words["metrics"]), dict(words["config"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except BROKEN as error:
         raise misfit(stem, error) from error
     planar.eval().requires_grad_(False)
     return Parameterization(phi, planar, metrics, config, correction)

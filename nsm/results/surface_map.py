@@ -14,8 +14,9 @@ from torch import nn
 from nsm.maps import Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, mended
-from nsm.results.files import misfit, read_pair, write_pair
+from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
+from nsm.results.networks import network_of
 from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 
@@ -181,14 +182,18 @@ def load_surface_map(folder: str | Path) -> SurfaceMap:
     source, target = load_surface(place / "source"), load_surface(place / "target")
     try:
         correction = Correction.taken(tensors, len(source.surface.vertices))
-        h = Rotated(build_planar(words["map"]), torch.eye(2))
-        h.load_state_dict(tensors)
+        h = network_of(rotated_planar, words["map"], tensors)
         landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, 2)
         metrics, config = dict(words["metrics"]), dict(words["config"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except BROKEN as error:
         raise misfit(place / STEM, error) from error
     h.eval().requires_grad_(False)
     return SurfaceMap(source, target, h, landmarks, metrics, config, correction)
+
+
+def rotated_planar(config: dict[str, Any]) -> Rotated:
+    """The planar map of a configuration, its input turned by a rotation that is still to come."""
+    return Rotated(build_planar(config), torch.eye(2, device="cpu"))
 
 
 def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:

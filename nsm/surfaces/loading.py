@@ -7,6 +7,7 @@ plyfile (ascii, binary, triangle strips); STL and glTF through trimesh.
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -14,6 +15,8 @@ import numpy as np
 
 from nsm.errors import NsmError
 
+_LONGEST_HEADER = 100_000  # bytes
+LARGEST_FILE = 4 * 2**30  # bytes
 EXTENSIONS = (".obj", ".ply", ".off", ".stl", ".gltf", ".glb")
 
 
@@ -25,13 +28,24 @@ def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     """
     file = Path(path)
     suffix = file.suffix.lower()
-    if file.is_dir():
+    try:
+        status = file.stat()
+    except FileNotFoundError:
+        raise NsmError(f"{file}: no such file; check the path") from None
+    except (OSError, ValueError) as error:  # too long, a loop of links, not allowed, a NUL in it
+        reason = getattr(error, "strerror", None) or "not a path"
+        raise NsmError(f"{file}: {reason}; check the path") from error
+    if stat.S_ISDIR(status.st_mode):
         raise NsmError(f"{file}: is a folder; give a mesh file")
-    if not file.exists():
-        raise NsmError(f"{file}: no such file; check the path")
     if suffix not in EXTENSIONS:
         raise NsmError(
             f"{file}: unknown mesh format '{suffix}'; use one of {', '.join(EXTENSIONS)}"
+        )
+    if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for, a device read for ever
+        raise NsmError(f"{file}: not a regular file; give a mesh file")
+    if status.st_size > LARGEST_FILE:
+        raise NsmError(
+            f"{file}: larger than {LARGEST_FILE / 2**30:.0f} GB; simplify the mesh before"
         )
     reader = {".obj": _read_obj, ".off": _read_off, ".ply": _read_ply}.get(suffix, _read_trimesh)
     try:
@@ -117,6 +131,8 @@ def _read_off(file: Path) -> _Read:
         raise ValueError("no OFF header")
     rows = ([rows[0][1:]] if len(rows[0]) > 1 else []) + rows[1:]
     n_vertices, n_faces = int(rows[0][0]), int(rows[0][1])
+    if min(n_vertices, n_faces) < 0:
+        raise ValueError(f"{min(n_vertices, n_faces)} announced of what is counted")
     if len(rows) < 1 + n_vertices + n_faces:
         raise ValueError(
             f"{n_vertices} vertices and {n_faces} faces announced, {len(rows) - 1} lines found"
@@ -135,6 +151,7 @@ def _read_off(file: Path) -> _Read:
 def _read_ply(file: Path) -> _Read:
     from plyfile import PlyData
 
+    _check_ply_header(file)
     with file.open("rb") as stream:
         ply = PlyData.read(stream)
     elements = {element.name: element for element in ply.elements}
@@ -158,6 +175,18 @@ def _read_ply(file: Path) -> _Read:
     return vertices, np.zeros((0, 3), dtype=np.int64), []
 
 
+def _check_ply_header(file: Path) -> None:
+    """ValueError if the header announces more than the file can hold: room is made for it."""
+    with file.open("rb") as stream:
+        head = stream.read(_LONGEST_HEADER).partition(b"end_header")[0]
+    size = file.stat().st_size
+    for line in head.splitlines():
+        words = line.split()
+        if words[:1] == [b"element"] and len(words) == 3:
+            if not 0 <= int(words[2]) <= size:
+                raise ValueError(f"{int(words[2])} of an element in {size} bytes")
+
+
 def strips_to_triangles(strip: np.ndarray) -> np.ndarray:
     """Triangles (F,3) of -1-separated strips (N,): every second triangle is turned round.
 
@@ -176,7 +205,15 @@ def strips_to_triangles(strip: np.ndarray) -> np.ndarray:
 def _read_trimesh(file: Path) -> _Read:
     import trimesh
 
-    loaded = trimesh.load(file, process=False)
+    from nsm.surfaces.gltf import Beside, check_gltf
+
+    kind = file.suffix.lower()[1:]
+    if kind in ("gltf", "glb"):
+        check_gltf(file)
+    with file.open("rb") as stream:
+        loaded = trimesh.load(
+            stream, file_type=kind, process=False, resolver=Beside(file.parent), allow_remote=False
+        )
     log: list[str] = []
     if isinstance(loaded, trimesh.Scene):
         meshes = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
@@ -203,4 +240,4 @@ def _text(file: Path) -> str:
     raw = file.read_bytes()
     if b"\0" in raw[:4096]:
         raise ValueError("binary data where text is expected")
-    return raw.decode("utf-8", errors="replace")
+    return raw.decode("utf-8-sig", errors="replace")
