@@ -137,6 +137,7 @@ def fitted(
     if config.logger.tensorboard:
         logger = TensorBoardLogger(save_dir=folder, name="", version="tensorboard")
         callbacks += [LearningRateMonitor(), pictures]
+    module.log_every = config.logger.every
     quiet_lightning()
     accelerator = settings.accelerator
     if accelerator == "auto":  # Lightning would choose Apple's GPU, which has no float64

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
 from nsm.energies import blend, landmark
 from nsm.tasks.optimizers import configure
 from nsm.tasks.rim import rim
+from nsm.tasks.training import Training
 from nsm.tasks.weakest import carefully, stronger
 
 BOUNDARIES = ("exact", "penalty")
@@ -61,7 +61,7 @@ class Constraints:
         return domain if self.boundary == "exact" else None
 
 
-class ConstrainedMap(pl.LightningModule):
+class ConstrainedMap(Training):
     """Base of the tasks that map surfaces to surfaces.
 
     Subclasses set ``map``, call ``hold`` with the landmarks, and sum their terms by ``total``.
@@ -120,9 +120,7 @@ class ConstrainedMap(pl.LightningModule):
         for name, value in terms.items():
             share = self.ramped if name == "seam" else 1.0
             loss = loss + share * getattr(self.constraints, f"lambda_{name}") * value
-            self.log(f"train/{name}", value)
-        self.log("train/distortion", distortion)
-        self.log("train/loss", loss)
+        self.note({**terms, "distortion": distortion, "loss": loss})
         return loss
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:

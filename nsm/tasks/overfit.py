@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
@@ -12,9 +11,10 @@ from nsm.data import Samples
 from nsm.energies.overfit import normal, position
 from nsm.maps import build_map
 from nsm.tasks.optimizers import configure
+from nsm.tasks.training import Training
 
 
-class Overfit(pl.LightningModule):
+class Overfit(Training):
     """L = mean ‖f − φ‖² + λ_n mean ‖n_φ − n_f‖² over samples of the surface.
 
     Args:
@@ -48,15 +48,13 @@ class Overfit(pl.LightningModule):
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         if self.lambda_normal == 0:
             loss = position(self.map(batch.uv), batch.points).mean()
-            self.log("train/position", loss)
+            self.note({"position": loss, "loss": loss})
         else:
             value, jacobian = self.map.value_and_jacobian(batch.uv)
             at = position(value, batch.points).mean()
             turn = normal(jacobian, batch.normals).mean()
             loss = at + self.lambda_normal * turn
-            self.log("train/position", at)
-            self.log("train/normal", turn)
-        self.log("train/loss", loss)
+            self.note({"position": at, "normal": turn, "loss": loss})
         return loss
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:

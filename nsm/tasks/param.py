@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
@@ -12,12 +11,13 @@ from nsm.data import Samples
 from nsm.energies import blend, first_fundamental_form, injectivity
 from nsm.maps import build_planar
 from nsm.tasks.optimizers import configure
+from nsm.tasks.training import Training
 from nsm.tasks.weakest import Weakest, carefully, stronger
 
 BOUNDARIES = ("free", "fixed")
 
 
-class Param(pl.LightningModule):
+class Param(Training):
     """L = mean E(A, B) + λ_inv mean G(det J_h) + λ_tri U, A = J_φᵀJ_φ, B = J_hᵀJ_h (METHOD, Param).
 
     U keeps the mesh's triangles from folding (:class:`nsm.tasks.weakest.Weakest`). With a fixed
@@ -73,13 +73,12 @@ class Param(pl.LightningModule):
         distortion, determinant = self._distortion(batch.uv)
         fold = injectivity(determinant).mean()
         loss = distortion + self.lambda_injectivity * fold
-        self.log("train/distortion", distortion)
-        self.log("train/injectivity", fold)
+        figures = {"distortion": distortion, "injectivity": fold}
         if self.lambda_triangles > 0:
             weak = self.weakest(self.map, self.global_step)
             loss = loss + self.lambda_triangles * weak
-            self.log("train/triangles", weak)
-        self.log("train/loss", loss)
+            figures["triangles"] = weak
+        self.note({**figures, "loss": loss})
         return loss
 
     def _distortion(self, uv: Tensor) -> tuple[Tensor, Tensor]:
