@@ -62,14 +62,18 @@ _GREY = np.array([0.80, 0.82, 0.85])
 def _picture(view: View, vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     image = view.draw(vertices, faces, lambda blend: _GREY)
     picture = Image.fromarray(np.round(255 * image).astype(np.uint8))
-    picture.quantize(64).save(PICTURES / f"activation-{name}.png", optimize=True)
+    picture.convert("L").save(PICTURES / f"activation-{name}.png", optimize=True)
 
 
 def _pictures(name: str, neural: NeuralSurface) -> None:
-    """The forepart of the surface, where the source is smooth, on triangles far finer than it."""
+    """The trunk of the surface, where the source is smooth, on triangles far finer than its own."""
     surface = neural.surface
-    x = surface.vertices @ View(surface.vertices, _SIDE).frame[0]
-    view = View(surface.vertices[x > np.percentile(x, 55)], _SIDE)
+    across, up = (surface.vertices @ View(surface.vertices, _SIDE).frame.T).T[:2]
+    trunk = np.ones(len(across), dtype=bool)
+    for place in (across, up):
+        low, high = np.percentile(place, [30, 95])
+        trunk &= (place > low) & (place < high)
+    view = View(surface.vertices[trunk], _SIDE)
     uv, faces = surface.uv, surface.faces
     for _ in range(2):
         uv, faces = subdivide(uv, faces)

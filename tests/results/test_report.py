@@ -36,7 +36,7 @@ HOSTILE = "<img src=x onerror=window.pwned=1> %{x} <b>bold<"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Path:
-    """Two overfits as a sweep, a flattening and a map; one run is interrupted, another damaged."""
+    """Two overfits as a sweep, a flattening and a map; runs interrupted, damaged and failed."""
     folder = tmp_path_factory.mktemp("runs")
     sweep = folder / "sweep"
     for name, activation in ((HOSTILE, "silu"), ("1", "relu")):
@@ -50,13 +50,15 @@ def runs(tmp_path_factory) -> Path:
     (folder / "interrupted" / "metrics.json").unlink()
     shutil.copytree(sweep / "1", folder / "truncated")
     (folder / "truncated" / "metrics.json").write_text('{"steps": 20, "metri')
+    (folder / "failed").mkdir()
+    (folder / "failed" / "error.txt").write_text("Traceback\nValueError: <b>too much</b>\n")
     return folder
 
 
 @pytest.fixture(scope="module")
 def page(runs, tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("page") / "report.html"
-    assert write_report([runs], file, f"Title {HOSTILE}") == (4, 2)
+    assert write_report([runs], file, f"Title {HOSTILE}") == (4, 3)
     return file
 
 
@@ -170,6 +172,7 @@ def test_incomplete_and_damaged_runs_are_listed(runs, page, tmp_path):
     reasons = {item["name"]: item["reason"] for item in content(page)["incomplete"]}
     assert "not finished" in reasons["interrupted"]
     assert "metrics.json is damaged" in reasons["truncated"]
+    assert reasons["failed"] == "failed: ValueError: <b>too much</b>"
     bad = tmp_path / "bad"
     shutil.copytree(runs / "sweep" / "1", bad)
     (bad / "surface.safetensors").write_bytes(b"short")

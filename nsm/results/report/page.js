@@ -204,7 +204,8 @@
     const tags = [...new Set(task.runs.flatMap((run) => Object.keys(run.curves)))];
     $("#curves").hidden = !tags.length;
     if (!tags.length) return;
-    const first = ["val/rms_percent", "val/distortion", "train/loss"].find((tag) => tags.includes(tag)) ?? tags[0];
+    const first = ["val/rms_percent", "val/distortion", "train/loss"]
+      .find((tag) => task.runs.some((run) => run.curves[tag]?.steps.length > 2)) ?? tags[0];
     const timed = task.runs.some((run) => Object.values(run.curves).some((curve) => curve.seconds));
     if (!tags.includes(choices.tag)) choices.tag = first;
     control("#curves", select("curve", tags, "tag", drawCurves),

@@ -67,7 +67,7 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
             if len(folders) > 1 and inner != ".":
                 name = f"{folder.resolve().name}/{inner}"
             if not (place / "metrics.json").exists():
-                incomplete.append(Incomplete(name, "no metrics.json: not finished"))
+                incomplete.append(Incomplete(name, _unfinished(place)))
                 continue
             try:
                 runs.append(_read(place, name))
@@ -82,10 +82,19 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
 def _run_folders(folder: Path) -> Iterator[Path]:
     for path, inner, files in os.walk(folder):
         inner.sort(key=lambda name: (len(name), name) if name.isdigit() else (0, name))
-        if "metrics.json" in files or "config.yaml" in files:
+        if not {"metrics.json", "config.yaml", "error.txt"}.isdisjoint(files):
             yield Path(path)
         if "metrics.json" in files:
             inner.clear()  # what lies in a run's folder belongs to it
+
+
+def _unfinished(folder: Path) -> str:
+    """Why there are no figures: what a sweep wrote down of a job that failed, if it did."""
+    try:
+        lines = (folder / "error.txt").read_text(encoding="utf-8").strip().splitlines()
+    except (OSError, ValueError):
+        lines = []
+    return f"failed: {lines[-1][:300]}" if lines else "no metrics.json: not finished"
 
 
 def _read(folder: Path, name: str) -> Run:
