@@ -11,8 +11,8 @@ test: check
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 check: .venv/.nsm-dev
-	$(BIN)/ruff check nsm tests benchmarks
-	$(BIN)/ruff format --check nsm tests benchmarks
+	$(BIN)/ruff check nsm hydra_plugins tests benchmarks
+	$(BIN)/ruff format --check nsm hydra_plugins tests benchmarks
 	$(BIN)/mypy
 
 # Error against time, default beside paper settings: about an hour. MESHES names the folder.

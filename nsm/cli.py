@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nsm.config import checked, conf_folder, one_line, register_resolvers
 from nsm.errors import NsmError
+from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
 # input. Imported only when called for.
@@ -22,7 +23,10 @@ COMMANDS: dict[str, str] = {"report": "nsm.commands.report"}
 
 
 def _run(config: DictConfig) -> bool:
-    """Run one job; False if its input was bad, so that the other jobs of a sweep go on."""
+    """Run the one job of a command that is no sweep; False if its input was bad.
+
+    Hydra would add a line of its own to an exception.
+    """
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
@@ -46,7 +50,8 @@ def _run(config: DictConfig) -> bool:
 
 
 def main() -> None:
-    """Entry point. Exit status 0, 2 for bad input (one line on stderr) or 130 if interrupted."""
+    """Entry point. Exit status 0; 1 if jobs of a sweep failed, 2 for bad input (one line on
+    stderr), 130 if interrupted."""
     words = sys.argv[1:]
     if words and words[0] in COMMANDS:
         _command(COMMANDS[words[0]], words[1:])
@@ -69,24 +74,41 @@ def _command(module: str, words: list[str]) -> None:
 def _tasks() -> None:
     register_resolvers()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach us instead of being printed
-    results: list[bool] = []
+    OUTCOMES.clear()
+    good: list[bool] = []
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
 
     @hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
     def job(config: DictConfig) -> None:
-        results.append(_run(config))
+        good.append(_run(config))
 
     try:
         job()
+    except NsmError as error:
+        _say(str(error))
+        sys.exit(2)
     except (HydraException, OmegaConfBaseException) as error:
-        _say(one_line(error, [word for word in sys.argv[1:] if not word.startswith("-")]))
+        _say(one_line(error, words))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
     except OSError as error:  # Hydra makes the run folder before anything of ours runs
         _say(_of_disk(error))
         sys.exit(2)
-    if not all(results):
+    if not all(good):
         sys.exit(2)
+    if OUTCOMES:
+        _sum_up()
+
+
+def _sum_up() -> None:
+    """Say how a sweep went; exit status 1 if jobs of it failed."""
+    failed = [outcome for outcome in OUTCOMES if outcome.error is not None]
+    print(summary(OUTCOMES))
+    for outcome in failed:
+        _say(f"failed: {' '.join(outcome.words) or outcome.folder}: {outcome.error}")
+    if failed:
+        sys.exit(1)
 
 
 def _of_disk(error: OSError) -> str:

@@ -19,6 +19,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from nsm.errors import NsmError
+from nsm.sweeps import sweep_folder
 
 
 @dataclass
@@ -148,8 +149,9 @@ def conf_folder() -> Path:
 
 
 def register_resolvers() -> None:
-    """Make ``nsm.run_folder`` known to the configuration files."""
+    """Make ``nsm.run_folder`` and ``nsm.sweep_folder`` known to the configuration files."""
     OmegaConf.register_new_resolver("nsm.run_folder", _run_folder, replace=True, use_cache=True)
+    OmegaConf.register_new_resolver("nsm.sweep_folder", sweep_folder, replace=True)
 
 
 def _run_folder(

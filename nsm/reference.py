@@ -16,7 +16,7 @@ from nsm.config import conf_folder
 
 _PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
 _SETTING = re.compile(r"( *)([^\s:#-][^:]*):(?:\s+(.*))?$")
-_DEFAULT = re.compile(r"  - ([^\s:]+): (\S+)$")
+_DEFAULT = re.compile(r"  - (?:override )?([^\s:]+): (\S+)$")
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ def groups() -> list[Group]:
     """
     read = {name: [*_options(name)] for name, _, _ in _defaults_list()}
     settings = [s for options in read.values() for option in options for s in option.settings]
+    settings += ungrouped()
     remarks = {s.key: s.remark for s in reversed(settings) if s.remark}
 
     def filled(option: Option) -> Option:
@@ -80,9 +81,8 @@ def _defaults_list() -> Iterator[tuple[str, str, str]]:
         if line.startswith("  #"):
             remark.append(line.strip(" #"))
         elif entry:
-            name = entry.group(1).removeprefix("override ")
-            if "/" not in name or remark:
-                yield name, entry.group(2), " ".join(remark)
+            if remark:  # the others are Hydra's, and nothing to choose
+                yield entry.group(1), entry.group(2), " ".join(remark)
             remark = []
 
 
@@ -104,7 +104,7 @@ def read_option(file: Path, group: str) -> Option:
         for setting in _settings("\n".join(lines[1:] if remark else lines))
     ]
     # what the option's name says already is not told again
-    said = (group, f"{group}.name")
+    said = (group, f"{group}.name", f"{dotted}_target_", "hydra.mode")
     return Option(file.stem, remark, tuple(s for s in settings if s.key not in said))
 
 

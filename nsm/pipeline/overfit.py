@@ -7,6 +7,7 @@ import json
 import time
 from pathlib import Path
 
+from filelock import FileLock
 from omegaconf import DictConfig
 from rich.console import Console
 
@@ -142,10 +143,12 @@ def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralS
     settings["trainer"].pop("progress")
     text = surface.content_key() + json.dumps(settings, sort_keys=True)
     folder = cache_folder() / "neural" / hashlib.sha256(text.encode()).hexdigest()[:32]
-    if (folder / "metrics.json").exists():
-        console.print(f"{surface.name}: neural surface taken from the cache")
-        return load_surface(folder)
-    return run_overfit(overfit, folder, surface, resuming=(folder / CHECKPOINT_FILE).exists())
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
+        if (folder / "metrics.json").exists():
+            console.print(f"{surface.name}: neural surface taken from the cache")
+            return load_surface(folder)
+        return run_overfit(overfit, folder, surface, resuming=(folder / CHECKPOINT_FILE).exists())
 
 
 def build_overfit(config: DictConfig, surface: Surface) -> Overfit:

@@ -1,0 +1,265 @@
+"""Launchers: where the jobs of a sweep run.
+
+All of them check the settings of every job before the first starts, skip what is complete, keep
+each job's failure to itself, and say in the end what became of them. A job is handed over as plain
+settings and a folder, so that the place where it runs needs nothing of Hydra.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from nsm.errors import NsmError
+from nsm.sweeps import OUTCOMES, Job, Outcome, is_complete, job_folder, swept_keys
+
+_KILLED = "its process was killed, perhaps for want of memory"
+_POLL = 0.5  # seconds
+
+
+Finished = tuple[Job, "str | None"]  # with what made it fail
+
+
+class SweepLauncher(Launcher):
+    """Base of the launchers; subclasses run jobs."""
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        self.config, self.loader = config, hydra_context.config_loader
+
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> Sequence[JobReturn]:
+        """Run the jobs; their outcomes are in the return values.
+
+        Raises:
+            NsmError: settings of a job that cannot be used, before any job starts.
+        """
+        jobs = [self._job(overrides) for overrides in job_overrides]
+        outcomes = {
+            job.folder: Outcome(job.words, job.folder, before=True)
+            for job in jobs
+            if is_complete(job.folder)
+        }
+        for outcome in outcomes.values():
+            self._say(f"complete before: {_words(outcome)}")
+        waiting = {job.folder: job for job in jobs if job.folder not in outcomes}
+        for number, (job, error) in enumerate(self.run(list(waiting.values())), start=1):
+            outcome = Outcome(job.words, job.folder, error)
+            outcomes[job.folder] = outcome
+            became = f"failed: {_words(outcome)}: {error}" if error else f"done: {_words(outcome)}"
+            self._say(f"[{number}/{len(waiting)}] {became}")
+        OUTCOMES.extend(outcomes.values())
+        return [_returned(outcomes[job.folder]) for job in jobs]
+
+    def run(self, jobs: list[Job]) -> Iterator[Finished]:
+        """Run the jobs, and yield each as it ends."""
+        raise NotImplementedError
+
+    def _job(self, overrides: Sequence[str]) -> Job:
+        from nsm.config import checked
+
+        hydra = self.config.hydra
+        keys = swept_keys(hydra.overrides.task, hydra.sweeper.params)
+        words = tuple(word for word in overrides if word.split("=")[0] in keys)
+        config = self.loader.load_sweep_config(self.config, list(overrides))
+        with open_dict(config):
+            del config["hydra"]
+        try:
+            settings: Any = OmegaConf.to_container(checked(config))
+        except NsmError as error:
+            raise NsmError(f"{' '.join(words) or 'the job'}: {error}") from error
+        return Job(settings, job_folder(Path(hydra.sweep.dir), settings, words), words)
+
+    def _say(self, line: str) -> None:
+        print(line, flush=True)
+
+
+class Serial(SweepLauncher):
+    """One job after the other in this process."""
+
+    def run(self, jobs: list[Job]) -> Iterator[Finished]:
+        from nsm.pipeline.jobs import run_job
+
+        for job in jobs:
+            self._say(f"next: {' '.join(job.words) or job.folder.name}")
+            yield job, run_job(*job.call, log=False)
+
+
+class Joblib(SweepLauncher):
+    """Processes on this machine.
+
+    Args:
+        n_jobs: jobs at a time; -1 for as many as there are cores.
+    """
+
+    def __init__(self, n_jobs: int) -> None:
+        self.n_jobs = n_jobs
+
+    def run(self, jobs: list[Job]) -> Iterator[Finished]:
+        joblib = needed("joblib", "hydra/launcher=joblib")
+        left = list(jobs)
+        try:
+            for place, error in self._pool(joblib, self.n_jobs, jobs):
+                job = next(job for job in left if job.folder == place)
+                left.remove(job)
+                yield job, error
+            return
+        except BrokenProcessPool:
+            pass
+        # A killed process takes the pool with it. The rest goes on singly, so that it is seen
+        # which job it is; with two places for one job joblib still makes a process for it.
+        for job in left:
+            try:
+                yield job, next(iter(self._pool(joblib, 2, [job])))[1]
+            except BrokenProcessPool:
+                yield job, _KILLED
+
+    def _pool(self, joblib: Any, size: int, jobs: list[Job]) -> Iterator[tuple[Path, str | None]]:
+        pool = joblib.Parallel(
+            n_jobs=size,
+            backend="loky",
+            return_as="generator_unordered",
+            pre_dispatch="all",
+            batch_size=1,
+        )
+        return pool(joblib.delayed(_told)(job.folder, *job.call) for job in jobs)
+
+
+class Submitit(SweepLauncher):
+    """Jobs of a SLURM cluster, or processes of this machine that stand for them.
+
+    Args:
+        cluster: ``slurm`` or ``local``.
+        parallel: jobs at a time; None for no limit.
+        timeout_min, cpus_per_task, gpus_per_node, mem_gb: of a job.
+        parameters: further ones of ``submitit.AutoExecutor.update_parameters``.
+    """
+
+    def __init__(
+        self, cluster: str, parallel: int | None, parameters: dict[str, Any], **shared: Any
+    ) -> None:
+        self.cluster, self.parallel = cluster, parallel
+        self.parameters = {**shared, **parameters}
+
+    def run(self, jobs: list[Job]) -> Iterator[Finished]:
+        submitit = needed("submitit", "hydra/launcher=submitit")
+        folder = Path(self.config.hydra.sweep.dir) / ".submitit"
+        try:
+            executor = submitit.AutoExecutor(folder=folder, cluster=self.cluster)
+            executor.update_parameters(**self.parameters)
+        except (RuntimeError, ValueError, NameError) as error:
+            reason = " ".join(str(error).split())
+            raise NsmError(f"hydra/launcher=submitit: {reason}") from error
+        waiting = list(jobs)
+        running: dict[Any, Job] = {}
+        while waiting or running:
+            free = len(waiting) if self.parallel is None else self.parallel - len(running)
+            some, waiting = waiting[:free], waiting[free:]
+            if some:
+                submitted = executor.map_array(
+                    Resumable(), *zip(*(job.call for job in some), strict=True)
+                )
+                running.update(zip(submitted, some, strict=True))
+            for handle in [handle for handle in running if handle.done()]:
+                job = running.pop(handle)
+                try:
+                    yield job, handle.result()
+                except Exception as error:  # whatever ended the process, or a failed submission
+                    reason = " ".join(str(error).split())[:200]
+                    yield job, f"{_KILLED} ({reason})"
+            time.sleep(_POLL)
+
+
+class Resumable:
+    """A job as submitit runs it; one that is cut off by time goes on where it was."""
+
+    def __call__(self, settings: dict[str, Any], folder: str, cwd: str) -> str | None:
+        from nsm.pipeline.jobs import run_job
+
+        return run_job(settings, folder, cwd, log=True)
+
+    def checkpoint(self, *call: Any) -> Any:
+        """The job to be queued again."""
+        return importlib.import_module("submitit").helpers.DelayedSubmission(self, *call)
+
+
+class Ray(SweepLauncher):
+    """Jobs on a Ray cluster.
+
+    Args:
+        address: of the cluster; None for a Ray that is started here and ends with the sweep.
+        cpus_per_job, gpus_per_job: what a job takes up.
+        init: further parameters of ``ray.init``.
+    """
+
+    def __init__(
+        self, address: str | None, cpus_per_job: float, gpus_per_job: float, init: dict[str, Any]
+    ) -> None:
+        self.address, self.init = address, init
+        self.share = {"num_cpus": cpus_per_job, "num_gpus": gpus_per_job}
+
+    def run(self, jobs: list[Job]) -> Iterator[Finished]:
+        if not jobs:
+            return
+        ray = needed("ray", "hydra/launcher=ray")
+        try:
+            ray.init(**{**_RAY, "address": self.address, **self.init})
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise NsmError(f"hydra/launcher=ray: {' '.join(str(error).split())}") from error
+        try:
+            # a process for each job, which leaves nothing behind for the next
+            remote = ray.remote(max_calls=1, max_retries=0, **self.share)(_told)
+            running = {remote.remote(job.folder, *job.call): job for job in jobs}
+            while running:
+                ended, _ = ray.wait(list(running))
+                for handle in ended:
+                    job = running.pop(handle)
+                    try:
+                        yield job, ray.get(handle)[1]
+                    except ray.exceptions.RayError as error:
+                        yield job, f"{_KILLED} ({type(error).__name__})"
+        finally:
+            ray.shutdown()
+
+
+_RAY = {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"}
+
+
+def needed(package: str, what: str) -> Any:
+    """A package of an extra.
+
+    Raises:
+        NsmError: it is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise NsmError(f"{what} needs {package}: pip install 'nsm[{package}]'") from error
+
+
+def _told(place: Path, settings: dict[str, Any], folder: str, cwd: str) -> tuple[Path, str | None]:
+    """Run a job in a process of its own, and say which it was."""
+    from nsm.pipeline.jobs import run_job
+
+    return place, run_job(settings, folder, cwd, log=True)
+
+
+def _words(outcome: Outcome) -> str:
+    return " ".join(outcome.words) or outcome.folder.name
+
+
+def _returned(outcome: Outcome) -> JobReturn:
+    value = JobReturn(overrides=outcome.words, status=JobStatus.COMPLETED)
+    value.return_value = outcome
+    return value

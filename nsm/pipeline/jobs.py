@@ -1,0 +1,80 @@
+"""A job of a sweep, run wherever the launcher has put it."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from omegaconf import OmegaConf
+
+from nsm.config import checked, register_resolvers
+from nsm.errors import NsmError
+from nsm.pipeline import run
+from nsm.pipeline.common import CONFIG_FILE
+from nsm.sweeps import is_complete
+
+ERROR_FILE, LOG_FILE, LOCK_FILE = "error.txt", "log.txt", ".lock"
+
+
+def run_job(settings: dict[str, Any], folder: str, cwd: str, *, log: bool) -> str | None:
+    """Run a job in its folder, or go on with it from its checkpoint.
+
+    Whatever goes wrong concerns this job alone: it is written to ``error.txt`` in the folder.
+
+    Args:
+        settings: the whole configuration, as plain dictionaries and lists.
+        folder: the run folder.
+        cwd: the folder that relative paths in the settings are meant from.
+        log: write what is printed to ``log.txt`` in the folder, not to the terminal.
+
+    Returns:
+        Why the job failed, in one line, or None.
+    """
+    os.chdir(cwd)
+    register_resolvers()
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    (place / ERROR_FILE).unlink(missing_ok=True)
+    lock = FileLock(place / LOCK_FILE, timeout=0)
+    try:
+        with lock, _output(place / LOG_FILE if log else None):
+            message = _attempt(settings, place)
+            (place / LOCK_FILE).unlink(missing_ok=True)
+    except Timeout:
+        return "another process is at work on it"
+    return message
+
+
+def _attempt(settings: dict[str, Any], place: Path) -> str | None:
+    try:
+        if not is_complete(place):  # another sweep may have been at it
+            config = checked(OmegaConf.create(settings))
+            if (place / CONFIG_FILE).is_file():
+                config.resume = str(place)
+            run(config, place)
+        return None
+    except NsmError as error:
+        message = text = str(error)
+    except Exception as error:  # a defect of nsm: the other jobs shall not suffer
+        message = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        text = traceback.format_exc()
+    (place / ERROR_FILE).write_text(text.rstrip() + "\n", encoding="utf-8")
+    return message
+
+
+@contextmanager
+def _output(file: Path | None) -> Iterator[None]:
+    if file is None:
+        yield
+        return
+    with (
+        file.open("a", encoding="utf-8") as stream,
+        redirect_stdout(stream),
+        redirect_stderr(stream),
+    ):
+        yield
