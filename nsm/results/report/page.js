@@ -332,7 +332,7 @@
           scene: {
             xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "manual", aspectratio: { x: ax, y: ay, z: az }, bgcolor: "transparent",
             uirevision: task.name + choices.shape,
-            camera: { up: { x: ux, y: uy, z: uz }, eye: { x: 1.3 * tx, y: 1.3 * ty, z: 1.3 * tz } },
+            camera: { up: { x: ux, y: uy, z: uz }, eye: { x: 1.45 * tx, y: 1.45 * ty, z: 1.45 * tz } },
           },
         }, CONFIG);
       if (!panes[n].bound) {
