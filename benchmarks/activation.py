@@ -107,7 +107,7 @@ def main() -> None:
             words = [mesh, f"activation={name}", *SETTINGS, *OWN.get(name, [])]
             run(compose_config(words), folder)
         words = json.loads((folder / "metrics.json").read_text())
-        kept = {key: words[key] for key in ("steps", "seconds", "metrics")}
+        kept = {key: words[key] for key in ("steps", "metrics")}
         results[name] = {"settings": [*SETTINGS, *OWN.get(name, [])], **kept}
         _pictures(name, load_surface(folder))
     text = json.dumps({"surface": SURFACE, "runs": results}, indent=1) + "\n"
