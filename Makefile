@@ -35,7 +35,7 @@ bench-activation: .venv/.nsm-dev
 	touch $@
 
 .venv/.nsm-dev: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,brain]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,brain,joblib,optuna]'
 	touch $@ .venv/.nsm
 
 clean:
