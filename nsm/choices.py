@@ -19,13 +19,14 @@ from typing import Any, Union
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nsm.energies import ENERGIES, blend
+from nsm.energies import ENERGIES, Blend
 from nsm.energies.constraints import DOMAINS
 from nsm.errors import NsmError
 from nsm.maps import build_map
 from nsm.maps.activations import ACTIVATIONS
 from nsm.maps.encodings import ENCODINGS
 from nsm.maps.networks import BLOCKS, INITIALISATIONS
+from nsm.results.loggers import LOGGERS, require
 from nsm.surfaces.correspondence import SEAMS
 from nsm.surfaces.parameterization import METHODS
 from nsm.tasks import Overfit, Param
@@ -64,6 +65,9 @@ def check_choices(config: DictConfig) -> None:
     _one_of("task.name", task, TASK_CHOICES)
     for key, words in _WORDS.items():
         _one_of(key, OmegaConf.select(config, key), words)
+    for kind in settings["logger"]["kinds"]:
+        _one_of("logger.kinds", kind, LOGGERS)
+        require(kind)
     for group, known in NAMED.items():
         _check_named(group, settings[group], known)
     choice = TASK_CHOICES[task]
@@ -231,7 +235,7 @@ def _build(settings: dict[str, Any], choice: TaskChoice) -> None:
         build_scheduler(optimizer, settings["scheduler"], settings["trainer"]["max_steps"])
     with _told("energy"):
         if "weights" in choice.energy:
-            blend(settings["energy"]["weights"])
+            Blend(settings["energy"]["weights"])
     with _told("constraints"):
         if choice.held:
             choice.held(**settings["constraints"])

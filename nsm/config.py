@@ -90,9 +90,11 @@ class TrainerSchema:
 
 @dataclass
 class LoggerSchema:
-    tensorboard: bool = MISSING
+    kinds: list[str] = MISSING
     every: int = MISSING
     pictures: int = MISSING
+    project: str = MISSING
+    uri: str | None = MISSING
 
 
 @dataclass

@@ -32,15 +32,15 @@ from nsm.energies.metrics import (
 )
 from nsm.energies.overfit import normal, position
 from nsm.energies.procrustes import rotation
-from nsm.energies.registry import ENERGIES, Energy, blend, energy
+from nsm.energies.registry import ENERGIES, Blend, Energy, energy
 
 __all__ = [
     "ENERGIES",
+    "Blend",
     "Energy",
     "Invariants",
     "area",
     "arap",
-    "blend",
     "boundary",
     "boundary_disc",
     "boundary_square",

@@ -48,28 +48,38 @@ def energy(name: str, **parameters: Any) -> Energy:
     return partial(function, **parameters)
 
 
-def blend(weights: Mapping[str, float]) -> Energy:
-    """Σ wᵢ·Eᵢ, with the energies' default parameters.
+class Blend:
+    """Σ wᵢ·Eᵢ, with the energies' default parameters; as a function of the metrics A and B.
 
     Args:
         weights: name of an energy to its weight.
 
-    Returns:
-        A function of the metrics A and B (..., 2, 2) to (...).
+    Attributes:
+        weights: the same, as floats.
 
     Raises:
         ValueError: there are no weights, a name is not known, or a weight is negative or not
             finite.
     """
-    if not weights:
-        raise ValueError("a blend of energies needs at least one weight")
-    for name, weight in weights.items():
-        if not (math.isfinite(weight) and weight >= 0):
-            raise ValueError(f"weight of energy {name!r} is negative or not finite: {weight}")
-    terms = [(energy(name), float(weight)) for name, weight in weights.items()]
 
-    def mixed(source: Tensor, target: Tensor) -> Tensor:
-        first, *rest = (weight * term(source, target) for term, weight in terms)
+    def __init__(self, weights: Mapping[str, float]) -> None:
+        if not weights:
+            raise ValueError("a blend of energies needs at least one weight")
+        for name, weight in weights.items():
+            if not (math.isfinite(weight) and weight >= 0):
+                raise ValueError(f"weight of energy {name!r} is negative or not finite: {weight}")
+        self.weights = {name: float(weight) for name, weight in weights.items()}
+        self._energies = {name: energy(name) for name in weights}
+
+    def parts(self, source: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """Each energy by name, without its weight: metrics A and B (..., 2, 2) to (...)."""
+        return {name: term(source, target) for name, term in self._energies.items()}
+
+    def total(self, parts: Mapping[str, Tensor]) -> Tensor:
+        """Σ wᵢ·Eᵢ of what ``parts`` gave."""
+        first, *rest = (self.weights[name] * part for name, part in parts.items())
         return sum(rest, start=first)
 
-    return mixed
+    def __call__(self, source: Tensor, target: Tensor) -> Tensor:
+        """Σ wᵢ·Eᵢ: metrics A and B (..., 2, 2) to (...)."""
+        return self.total(self.parts(source, target))

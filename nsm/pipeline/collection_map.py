@@ -114,7 +114,7 @@ def run_collection_map(
         **certificate,
         "metrics": result.metrics,
     }
-    write_figures(folder, first, trainer, started, figures)
+    write_figures(config, folder, first, trainer, started, figures)
     console.print(collection_table(result.metrics))
     console.print(f"results in {folder}", soft_wrap=True)
     return result
@@ -175,6 +175,7 @@ def build_collection_map(
             seam=torch.as_tensor(seam, dtype=torch.float32),
             turns=turns,
             mesh=mesh,
+            diagonals=[phi.surface.bounding_box_diagonal for phi in phis],
             phis=[phi.map for phi in phis],
         ),
     )

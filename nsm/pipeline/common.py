@@ -15,7 +15,6 @@ import pytorch_lightning as pl
 import torch
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import Callback, LearningRateMonitor
-from pytorch_lightning.loggers import TensorBoardLogger
 from rich.console import Console
 
 from nsm.data import OverfitData
@@ -23,7 +22,9 @@ from nsm.errors import NsmError
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
 from nsm.results.files import as_json, check_stored
+from nsm.results.loggers import build_loggers, close, log_figures
 from nsm.results.progress import TrainingProgress
+from nsm.results.throughput import Throughput
 from nsm.surfaces import Surface
 
 CONFIG_FILE = "config.yaml"
@@ -133,10 +134,8 @@ def fitted(
     if settings.progress:
         shown = (module.progress_figure, module.progress_form)
         callbacks.append(TrainingProgress(console, title, *shown))
-    logger: TensorBoardLogger | bool = False
-    if config.logger.tensorboard:
-        logger = TensorBoardLogger(save_dir=folder, name="", version="tensorboard")
-        callbacks += [LearningRateMonitor(), pictures]
+    if config.logger.kinds:
+        callbacks += [LearningRateMonitor(), Throughput(config.logger.every), pictures]
     module.log_every = config.logger.every
     quiet_lightning()
     accelerator = settings.accelerator
@@ -149,7 +148,7 @@ def fitted(
             max_steps=settings.max_steps,
             max_epochs=-1,
             gradient_clip_val=settings.gradient_clip,
-            logger=logger,
+            logger=False,
             callbacks=callbacks,
             log_every_n_steps=config.logger.every,
             num_sanity_val_steps=0,
@@ -163,12 +162,21 @@ def fitted(
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
     # killed before the first checkpoint, a run starts again from its beginning
-    checkpoint = folder / CHECKPOINT_FILE
+    checkpoint = folder / CHECKPOINT_FILE if resuming else None
+    first_step = _step_of(checkpoint) if checkpoint and checkpoint.is_file() else 0
+    if not first_step:
+        checkpoint = None
+    logged = plain(config)["logger"]
+    kinds, places = logged["kinds"], {key: logged[key] for key in ("project", "uri", "every")}
+    trainer.loggers = build_loggers(kinds, folder, plain(config), first_step=first_step, **places)
     try:
-        _fit(trainer, module, data, checkpoint if resuming and checkpoint.is_file() else None)
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of an interrupt
         if not trainer.interrupted:
             raise
+    finally:
+        if trainer.state.status != "finished":
+            close(trainer.loggers, "failed")
     if trainer.interrupted:
         console.print(f"interrupted; go on with: nsm resume={folder}", soft_wrap=True)
         raise KeyboardInterrupt
@@ -183,29 +191,28 @@ def quiet_lightning() -> None:
     warnings.filterwarnings("ignore", module="lightning_fabric")
 
 
-def _fit(
-    trainer: pl.Trainer,
-    module: pl.LightningModule,
-    data: pl.LightningDataModule,
-    checkpoint: Path | None,
-) -> None:
-    if checkpoint is None:
-        trainer.fit(module, datamodule=data)
-        return
+def _step_of(checkpoint: Path) -> int:
+    """How many steps the training of a checkpoint has made."""
     try:
         check_stored(checkpoint)
-        torch.load(checkpoint, weights_only=True, map_location="cpu")
+        return int(torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"])
     except Exception as error:  # whatever a damaged or foreign file raises
         raise NsmError(
             f"{checkpoint}: damaged, or not a checkpoint of nsm; delete it to start again"
         ) from error
-    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 
 
 def write_figures(
-    folder: Path, surface: Surface, trainer: pl.Trainer, started: float, figures: dict[str, Any]
+    config: DictConfig,
+    folder: Path,
+    surface: Surface,
+    trainer: pl.Trainer,
+    started: float,
+    figures: dict[str, Any],
 ) -> None:
-    """Write metrics.json, last of all: its presence says that the run is complete."""
+    """Put the figures into the logs, and write metrics.json, last of all: its presence says that
+    the run is complete."""
+    log_figures(trainer.loggers, plain(config), figures["metrics"], trainer.global_step)
     words = {
         "surface": surface.name,
         "steps": trainer.global_step,

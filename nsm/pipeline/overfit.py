@@ -101,7 +101,7 @@ def run_overfit(
     save_surface(folder, neural)
     if config.artefacts:
         _write_artefacts(folder, neural)
-    write_figures(folder, surface, trainer, started, {"metrics": neural.metrics})
+    write_figures(config, folder, surface, trainer, started, {"metrics": neural.metrics})
     console.print(metrics_table(neural.metrics))
     console.print(f"results in {folder}", soft_wrap=True)
     return neural

@@ -106,6 +106,7 @@ def run_pair_map(
         _write_artefacts(folder, result)
     write_transferred(attributes, settings["attributes"], folder, result)
     write_figures(
+        config,
         folder,
         phi.surface,
         trainer,
@@ -159,6 +160,7 @@ def build_pair_map(
             seam=seam,
             turn=turn,
             mesh=(uv, torch.as_tensor(surface.faces)),
+            diagonal=psi.surface.bounding_box_diagonal,
             phi=phi.map,
             psi=psi.map,
         ),

@@ -82,7 +82,7 @@ def run_param(
     if config.artefacts:
         _write_artefacts(folder, result)
     figures = {**certificate, "metrics": result.metrics}
-    write_figures(folder, surface, trainer, started, figures)
+    write_figures(config, folder, surface, trainer, started, figures)
     console.print(comparison_table(result.metrics))
     ours = result.metrics["nsm"]
     if ours["flipped_percent"] == 0 and ours["boundary_self_intersections"]:

@@ -12,10 +12,10 @@ import numpy as np
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback
-from pytorch_lightning.loggers import TensorBoardLogger
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
+from nsm.results.loggers import log_picture
 
 
 class AtomicCheckpoint(Callback):
@@ -27,6 +27,12 @@ class AtomicCheckpoint(Callback):
 
     def __init__(self, path: Path) -> None:
         self.path = path
+
+    def on_train_batch_start(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        # going on from the end of an epoch, Lightning counts one step too many for the logs
+        trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         temporary = self.path.with_suffix(".tmp")
@@ -52,7 +58,7 @@ class GradientWatch(Callback):
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer
     ) -> None:
-        logging = trainer.global_step % self.every == 0
+        logging = (trainer.global_step + 1) % self.every == 0  # the steps that Lightning keeps
         if not logging and self.stop_norm is None:
             return
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
@@ -87,7 +93,7 @@ class GradientWatch(Callback):
 
 
 class Pictures(Callback):
-    """Put pictures into TensorBoard, evenly spread over the run.
+    """Put pictures into the logs, evenly spread over the run.
 
     Args:
         name: of the pictures.
@@ -103,12 +109,10 @@ class Pictures(Callback):
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         share = trainer.global_step / max(1, trainer.max_steps)
         due = int(share * self.count)
-        board = trainer.logger
-        if due <= self.taken or not isinstance(board, TensorBoardLogger):
+        if due <= self.taken:
             return
         self.taken = due
-        image = self.draw(pl_module)
-        board.experiment.add_image(self.name, image, trainer.global_step, dataformats="HWC")
+        log_picture(trainer.loggers, self.name, self.draw(pl_module), trainer.global_step)
 
     def state_dict(self) -> dict[str, Any]:
         return {"taken": self.taken}

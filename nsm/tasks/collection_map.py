@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import Rotated, build_planar
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.terms import Distortion
 from nsm.tasks.weakest import Weakest
 
 
@@ -29,6 +30,7 @@ class CollectionMap(ConstrainedMap):
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
         turns: (k, 2, 2) rotations of the inputs.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
+        diagonals: of each surface's bounding box, the units of the errors that are logged.
         phis: the surfaces; none is trained.
 
     Raises:
@@ -49,15 +51,18 @@ class CollectionMap(ConstrainedMap):
         seam: Tensor,
         turns: Tensor,
         mesh: tuple[Tensor, Tensor],
+        diagonals: Sequence[float],
         phis: Sequence[nn.Module],
     ) -> None:
         super().__init__(domain, weights, constraints, max_steps)
-        self.save_hyperparameters(ignore=["phis", "points", "targets", "seam", "turns", "mesh"])
+        given = ["phis", "points", "targets", "seam", "turns", "mesh"]
+        self.save_hyperparameters(ignore=given, logger=False)
         planar = {**map, "onto": self.constraints.onto(domain)}
         self.map = nn.ModuleList(Rotated(build_planar(planar), turn) for turn in turns)
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
         self.weakest = nn.ModuleList(Weakest(*mesh) for _ in phis)
         self.hold(points, targets, points @ turns.transpose(1, 2), seam)
+        self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
 
@@ -79,9 +84,9 @@ class CollectionMap(ConstrainedMap):
             terms["triangles"] = torch.stack([w(h, self.global_step) for h, w in both]).sum()
         return self.total(distortion, terms)
 
-    def _distortion(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean energy over the ordered pairs at points (N, 2), all det J_h (k, N), and all h
-        (k, N, 2) there."""
+    def _distortion(self, x: Tensor) -> tuple[Distortion, Tensor, Tensor]:
+        """Energy of the ordered pairs at points (N, 2), all det J_h (k, N), and all h (k, N, 2)
+        there."""
         metrics, determinants, images = [], [], []
         for h, phi in zip(self.map, self.phis, strict=True):
             image, inner = h.value_and_jacobian(x)  # type: ignore[operator]
@@ -97,9 +102,8 @@ class CollectionMap(ConstrainedMap):
         if self.constraints.boundary == "penalty":  # samples that went astray do not count
             share = share * inside(self.domain, everywhere.detach()).all(dim=0)
         i, j = self.ordered
-        energy = self.energy(forms[i], forms[j])
-        weighted = (share[i] * energy).sum(dim=1) / share[i].sum(dim=1).clamp(min=1e-12)
-        return weighted.mean(), torch.stack(determinants), everywhere
+        parts = self.energy.parts(forms[i], forms[j])
+        return Distortion(self.energy, parts, share[i]), torch.stack(determinants), everywhere
 
     def _seam_gap(self) -> Tensor:
         """Σ over surfaces of the mean squared distance between a seam point's two copies."""
@@ -111,5 +115,19 @@ class CollectionMap(ConstrainedMap):
         return total
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
-        distortion, determinant, _ = self._distortion(batch)
-        self.log_validation(distortion, determinant, len(batch))
+        self.log_validation(*self._distortion(batch))
+
+    def flipped_percent(self) -> Tensor:
+        both = zip(self.map, self.weakest, strict=True)
+        return torch.stack([w.flipped_percent(h) for h, w in both]).mean()  # type: ignore[operator]
+
+    def landmark_error(self) -> Tensor:
+        moved = self(self.points)
+        return torch.stack(
+            [
+                100 / diagonal * (phi(a) - phi(b)).norm(dim=1)
+                for phi, a, b, diagonal in zip(
+                    self.phis, moved, self.targets, self.diagonals, strict=True
+                )
+            ]
+        )

@@ -8,14 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nsm.energies import blend, landmark
+from nsm.energies import Blend, inside, landmark
 from nsm.tasks.optimizers import configure
 from nsm.tasks.rim import rim
+from nsm.tasks.terms import Distortion, HeldOut, Term
 from nsm.tasks.training import Training
 from nsm.tasks.weakest import carefully, stronger
 
 BOUNDARIES = ("exact", "penalty")
 LANDMARKS = ("augmented", "fixed")
+# Float32 places a point of the boundary this well, and no better.
+_ON_BOUNDARY = 1e-6
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,8 @@ class Constraints:
 class ConstrainedMap(Training):
     """Base of the tasks that map surfaces to surfaces.
 
-    Subclasses set ``map``, call ``hold`` with the landmarks, and sum their terms by ``total``.
+    Subclasses set ``map``, call ``hold`` with the landmarks, sum their terms by ``total``, and
+    answer ``flipped_percent`` and ``landmark_error``.
 
     Args:
         domain: ``disc`` or ``square``.
@@ -92,7 +96,8 @@ class ConstrainedMap(Training):
         max_steps: int,
     ) -> None:
         super().__init__()
-        self.domain, self.energy = domain, blend(weights)
+        self.domain, self.energy = domain, Blend(weights)
+        self.held_out = HeldOut()
         self.constraints = Constraints(**constraints)
         self.ramp_steps = self.constraints.ramp * max_steps
 
@@ -109,19 +114,20 @@ class ConstrainedMap(Training):
         """How far, from 0 to 1, landmarks and seam have come on the way to their full demand."""
         return min(1.0, self.global_step / self.ramp_steps) if self.ramp_steps else 1.0
 
-    def total(self, distortion: Tensor, terms: dict[str, Tensor]) -> Tensor:
+    def total(self, distortion: Distortion, terms: dict[str, Tensor]) -> Tensor:
         """The loss, with each term by its λ and, if there are any, with the landmarks; logged."""
-        loss = distortion
+        every: dict[str, Term] = dict(distortion.terms)
         if len(self.points):
             moved = self(self.points)
             wanted = self.start + self.ramped * (self.targets - self.start)
             terms = {**terms, "landmarks": landmark(moved, wanted).sum()}
-            loss = loss + (self.multipliers * (moved - wanted)).sum()
+            if self.constraints.landmarks == "augmented":
+                every["multipliers"] = (1.0, (self.multipliers * (moved - wanted)).sum())
         for name, value in terms.items():
             share = self.ramped if name == "seam" else 1.0
-            loss = loss + share * getattr(self.constraints, f"lambda_{name}") * value
-        self.note({**terms, "distortion": distortion, "loss": loss})
-        return loss
+            every[name] = (share * getattr(self.constraints, f"lambda_{name}"), value)
+        self.note({"distortion": distortion.mean})
+        return self.summed(every)
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         held = self.constraints
@@ -140,11 +146,36 @@ class ConstrainedMap(Training):
         self.ramp_steps = 0.0
         carefully(self, steps)
 
-    def log_validation(self, distortion: Tensor, determinant: Tensor, count: int) -> None:
-        """Log what is followed on held-out points: mean energy, and the share of folds."""
-        folded = 100 * (determinant <= 0).double().mean()
-        self.log("val/distortion", distortion, batch_size=count)
-        self.log("val/folded_percent", folded, batch_size=count)
+    def log_validation(self, distortion: Distortion, determinant: Tensor, image: Tensor) -> None:
+        """Log what is followed on held-out points: energy, and the shares of folds and of strays.
+
+        Args:
+            distortion: there.
+            determinant: det J_h (..., N).
+            image: h (..., N, 2).
+        """
+        count = image.shape[-2]
+        self.held_out.add(distortion)
+        folded, stray = determinant <= 0, ~inside(self.domain, image, tolerance=_ON_BOUNDARY)
+        self.log("val/distortion", distortion.mean, batch_size=count)
+        self.log("val/folded_percent", 100 * folded.double().mean(), batch_size=count)
+        self.log("val/outside_percent", 100 * stray.double().mean(), batch_size=count)
+
+    def on_validation_epoch_end(self) -> None:
+        self.log("val/distortion_median", self.held_out.median())
+        self.log("val/flipped_percent", self.flipped_percent())
+        if len(self.points):
+            error = self.landmark_error()
+            self.log("val/landmark_error_mean_percent", error.mean())
+            self.log("val/landmark_error_max_percent", error.max())
+
+    def flipped_percent(self) -> Tensor:
+        """Share of mesh triangles that h flips: a scalar."""
+        raise NotImplementedError
+
+    def landmark_error(self) -> Tensor:
+        """Distance of landmarks from their targets, on the surface, in percent of its diagonal."""
+        raise NotImplementedError
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)  # type: ignore[arg-type]

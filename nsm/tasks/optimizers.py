@@ -73,9 +73,10 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
     named = [(key, p) for key, p in module.named_parameters() if p.requires_grad]
     grids = [p for key, p in named if ".tables." in key]
     others = [p for key, p in named if ".tables." not in key]
-    groups: list[dict[str, Any]] = [{"params": others}]
+    # the names are those of the learning rates in the log
+    groups: list[dict[str, Any]] = [{"params": others, "name": "network"}]
     if grids:
-        groups.append({"params": grids, "lr": encoding_lr or rest["lr"]})
+        groups.append({"params": grids, "lr": encoding_lr or rest["lr"], "name": "encoding"})
     if name in _FUSED and not rest.get("foreach"):
         rest.setdefault("fused", True)
     try:
@@ -113,4 +114,5 @@ def configure(module: nn.Module, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     optimizer = build_optimizer(module, dict(settings["optimizer"]))
     scheduler = build_scheduler(optimizer, dict(settings["scheduler"]), settings["max_steps"])
-    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+    every_step = {"scheduler": scheduler, "interval": "step", "name": "learning_rate"}
+    return {"optimizer": optimizer, "lr_scheduler": every_step}

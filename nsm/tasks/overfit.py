@@ -37,7 +37,7 @@ class Overfit(Training):
         diagonal: float,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        self.save_hyperparameters(logger=False)
         self.map = build_map(map)
         self.lambda_normal, self.diagonal = lambda_normal, diagonal
 
@@ -47,15 +47,18 @@ class Overfit(Training):
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         if self.lambda_normal == 0:
-            loss = position(self.map(batch.uv), batch.points).mean()
-            self.note({"position": loss, "loss": loss})
-        else:
-            value, jacobian = self.map.value_and_jacobian(batch.uv)
-            at = position(value, batch.points).mean()
-            turn = normal(jacobian, batch.normals).mean()
-            loss = at + self.lambda_normal * turn
-            self.note({"position": at, "normal": turn, "loss": loss})
-        return loss
+            return self.summed({"position": (1.0, self._position(self.map(batch.uv), batch))})
+        value, jacobian = self.map.value_and_jacobian(batch.uv)
+        turn = normal(jacobian, batch.normals).mean()
+        terms = {
+            "position": (1.0, self._position(value, batch)),
+            "normal": (self.lambda_normal, turn),
+        }
+        return self.summed(terms)
+
+    @staticmethod
+    def _position(value: Tensor, batch: Samples) -> Tensor:
+        return position(value, batch.points).mean()
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         value, jacobian = self.map.value_and_jacobian(batch.uv)

@@ -11,6 +11,7 @@ from nsm.data import Samples
 from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import Composition, Rotated, build_planar
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.terms import Distortion
 from nsm.tasks.weakest import Weakest
 
 
@@ -29,6 +30,7 @@ class PairMap(ConstrainedMap):
             should be one point of the target.
         turn: rotation (2, 2) of h's input (see :mod:`nsm.tasks.start`).
         mesh: uv (V, 2) and faces (F, 3) of the source, whose triangles must not flip.
+        diagonal: of the target's bounding box, the unit of the errors that are logged.
         phi, psi: source and target; neither is trained.
 
     Raises:
@@ -49,18 +51,19 @@ class PairMap(ConstrainedMap):
         seam: Tensor,
         turn: Tensor,
         mesh: tuple[Tensor, Tensor],
+        diagonal: float,
         phi: nn.Module,
         psi: nn.Module,
     ) -> None:
         super().__init__(domain, weights, constraints, max_steps)
-        self.save_hyperparameters(
-            ignore=["phi", "psi", "points", "targets", "seam", "turn", "mesh"]
-        )
+        given = ["phi", "psi", "points", "targets", "seam", "turn", "mesh"]
+        self.save_hyperparameters(ignore=given, logger=False)
         self.map = Rotated(build_planar({**map, "onto": self.constraints.onto(domain)}), turn)
         self.phi = phi.eval().requires_grad_(False)
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
         self.weakest = Weakest(*mesh)
+        self.diagonal = diagonal
         self.hold(points, targets, points @ turn.T, seam)
 
     def forward(self, uv: Tensor) -> Tensor:
@@ -80,18 +83,17 @@ class PairMap(ConstrainedMap):
             terms["triangles"] = self.weakest(self.map, self.global_step)
         return self.total(distortion, terms)
 
-    def _distortion(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean energy at points (N, 2) of Ω, det J_h (N,) and h (N, 2) there."""
+    def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor, Tensor]:
+        """Energy at points (N, 2) of Ω, det J_h (N,) and h (N, 2) there."""
         with torch.no_grad():
             source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
         image, jacobian = self.map.value_and_jacobian(uv)
         _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
-        energy = self.energy(source, first_fundamental_form(outer @ jacobian))
-        if self.constraints.boundary == "penalty":
-            energy = energy[inside(self.domain, image)]
-            if not len(energy):  # all astray: only the pull back is left
-                return image.new_zeros(()), torch.linalg.det(jacobian), image
-        return energy.mean(), torch.linalg.det(jacobian), image
+        parts = self.energy.parts(source, first_fundamental_form(outer @ jacobian))
+        if self.constraints.boundary == "penalty":  # samples that went astray do not count
+            kept = inside(self.domain, image)
+            parts = {name: part[kept] for name, part in parts.items()}
+        return Distortion(self.energy, parts), torch.linalg.det(jacobian), image
 
     def _seam_gap(self) -> Tensor:
         """Mean squared distance on the target between the images of a seam point's two copies."""
@@ -99,5 +101,11 @@ class PairMap(ConstrainedMap):
         return ((a - b) ** 2).sum(dim=1).mean()
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        distortion, determinant, _ = self._distortion(batch.uv)
-        self.log_validation(distortion, determinant, len(batch.uv))
+        self.log_validation(*self._distortion(batch.uv))
+
+    def flipped_percent(self) -> Tensor:
+        return self.weakest.flipped_percent(self.map)
+
+    def landmark_error(self) -> Tensor:
+        off = self.image(self.points) - self.psi(self.targets)
+        return 100 / self.diagonal * off.norm(dim=1)

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import blend, first_fundamental_form, injectivity
+from nsm.energies import Blend, first_fundamental_form, injectivity
 from nsm.maps import build_planar
 from nsm.tasks.optimizers import configure
+from nsm.tasks.terms import Distortion, HeldOut, Term
 from nsm.tasks.training import Training
 from nsm.tasks.weakest import Weakest, carefully, stronger
 
@@ -56,14 +57,15 @@ class Param(Training):
         phi: nn.Module,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["phi", "mesh"])
+        self.save_hyperparameters(ignore=["phi", "mesh"], logger=False)
         if boundary not in BOUNDARIES:
             raise ValueError(f"boundary {boundary!r} is not one of {', '.join(BOUNDARIES)}")
-        self.energy = blend(weights)
+        self.energy = Blend(weights)
         self.map = build_planar({**map, "onto": domain if boundary == "fixed" else None})
         self.phi = phi.eval().requires_grad_(False)
         self.lambda_injectivity, self.lambda_triangles = lambda_injectivity, lambda_triangles
         self.weakest = Weakest(*mesh)
+        self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
         """(N, 2) points of Ω to the plane."""
@@ -72,22 +74,22 @@ class Param(Training):
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         distortion, determinant = self._distortion(batch.uv)
         fold = injectivity(determinant).mean()
-        loss = distortion + self.lambda_injectivity * fold
-        figures = {"distortion": distortion, "injectivity": fold}
+        terms: dict[str, Term] = {
+            **distortion.terms,
+            "injectivity": (self.lambda_injectivity, fold),
+        }
         if self.lambda_triangles > 0:
-            weak = self.weakest(self.map, self.global_step)
-            loss = loss + self.lambda_triangles * weak
-            figures["triangles"] = weak
-        self.note({**figures, "loss": loss})
-        return loss
+            terms["triangles"] = (self.lambda_triangles, self.weakest(self.map, self.global_step))
+        self.note({"distortion": distortion.mean})
+        return self.summed(terms)
 
-    def _distortion(self, uv: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean energy at points (N, 2) of Ω, and det J_h (N,) there; φ's work is not recorded."""
+    def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor]:
+        """Energy at points (N, 2) of Ω, and det J_h (N,) there; φ's work is not recorded."""
         with torch.no_grad():
             source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
         _, jacobian = self.map.value_and_jacobian(uv)
-        energy = self.energy(source, first_fundamental_form(jacobian)).mean()
-        return energy, torch.linalg.det(jacobian)
+        parts = self.energy.parts(source, first_fundamental_form(jacobian))
+        return Distortion(self.energy, parts), torch.linalg.det(jacobian)
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
@@ -97,8 +99,13 @@ class Param(Training):
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         distortion, determinant = self._distortion(batch.uv)
         folded = 100 * (determinant <= 0).double().mean()
-        self.log("val/distortion", distortion, batch_size=len(batch.uv))
+        self.held_out.add(distortion)
+        self.log("val/distortion", distortion.mean, batch_size=len(batch.uv))
         self.log("val/folded_percent", folded, batch_size=len(batch.uv))
+
+    def on_validation_epoch_end(self) -> None:
+        self.log("val/distortion_median", self.held_out.median())
+        self.log("val/flipped_percent", self.weakest.flipped_percent(self.map))
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pytorch_lightning as pl
 from torch import Tensor
+
+from nsm.tasks.terms import Term
 
 
 class Training(pl.LightningModule):
@@ -20,3 +24,20 @@ class Training(pl.LightningModule):
         """Log figures of a training step as ``train/NAME``, in the steps that the logger takes."""
         if (self.global_step + 1) % self.log_every == 0:
             self.log_dict({f"train/{name}": value for name, value in figures.items()})
+
+    def summed(self, terms: Mapping[str, Term]) -> Tensor:
+        """The loss Σ λ·term, logged with its terms.
+
+        Each term goes to the log as it is, ``train/NAME``, and times its λ, ``weighted/NAME``; the
+        latter add up to ``train/loss``.
+
+        Args:
+            terms: by name, λ and the term, a scalar.
+        """
+        parts = {name: weight * value for name, (weight, value) in terms.items()}
+        first, *rest = parts.values()
+        loss = sum(rest, start=first)
+        self.note({**{name: value for name, (_, value) in terms.items()}, "loss": loss})
+        if (self.global_step + 1) % self.log_every == 0:
+            self.log_dict({f"weighted/{name}": part for name, part in parts.items()})
+        return loss

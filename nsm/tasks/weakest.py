@@ -74,6 +74,10 @@ class Weakest(nn.Module):
         weakest = relative.topk(len(self.chosen), largest=False).indices
         self.chosen = weakest if index is None else index[weakest]
 
+    def flipped_percent(self, h: Callable[[Tensor], Tensor]) -> Tensor:
+        """Share of all the mesh's triangles whose image under h has no positive area."""
+        return 100 * (_double_areas(h(self.uv)[self.faces]) <= 0).double().mean()
+
 
 def _double_areas(corners: Tensor) -> Tensor:
     """Twice the signed areas (F,) of triangles (F, 3, 2)."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 from metric_samples import jacobians, metric
 
-from nsm.energies import ENERGIES, blend, distortion, energy
+from nsm.energies import ENERGIES, Blend, distortion, energy
 
 A, B = metric(jacobians(10, 3, 0)), metric(jacobians(10, 3, 1))
 
@@ -28,7 +28,7 @@ def test_a_misspelt_name_meets_the_nearest(wrong, meant):
     with pytest.raises(ValueError, match=f"did you mean '{meant}'"):
         energy(wrong)
     with pytest.raises(ValueError, match=f"did you mean '{meant}'"):
-        blend({"arap": 1.0, wrong: 1.0})
+        Blend({"arap": 1.0, wrong: 1.0})
 
 
 def test_parameters_are_checked():
@@ -39,7 +39,7 @@ def test_parameters_are_checked():
 
 
 def test_blend_is_the_weighted_sum():
-    mixed = blend({"arap": 0.25, "conformal": 2.0, "area": 0.0})
+    mixed = Blend({"arap": 0.25, "conformal": 2.0, "area": 0.0})
     want = 0.25 * energy("arap")(A, B) + 2.0 * energy("conformal")(A, B)
     torch.testing.assert_close(mixed(A, B), want)
 
@@ -47,4 +47,4 @@ def test_blend_is_the_weighted_sum():
 @pytest.mark.parametrize("weights", [{}, {"arap": -1.0}, {"arap": math.nan}, {"arap": math.inf}])
 def test_bad_weights_are_refused(weights):
     with pytest.raises(ValueError, match="weight"):
-        blend(weights)
+        Blend(weights)

@@ -1,0 +1,203 @@
+"""Where a training's curves, pictures and figures go: TensorBoard, CSV, W&B, MLflow."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from pytorch_lightning.loggers import (
+    CSVLogger,
+    Logger,
+    MLFlowLogger,
+    TensorBoardLogger,
+    WandbLogger,
+)
+
+from nsm.errors import NsmError
+from nsm.results.files import as_json, atomic_write
+
+# which run of W&B or MLflow a folder belongs to, so that resuming goes on with it
+IDENTITY_FILE = "logger.json"
+
+
+def build_loggers(
+    kinds: Sequence[str],
+    folder: Path,
+    settings: Mapping[str, Any],
+    *,
+    project: str,
+    uri: str | None,
+    every: int,
+    first_step: int,
+) -> list[Logger]:
+    """The loggers of a run, with its settings.
+
+    Args:
+        kinds: names of ``LOGGERS``.
+        folder: the run folder, which exists.
+        settings: of the run.
+        project: what W&B calls project, and MLflow experiment.
+        uri: of MLflow's server or store; None: that of MLFLOW_TRACKING_URI, or ``mlruns`` in the
+            working folder.
+        every: steps between two values.
+        first_step: where the training starts; what an interrupted one logged beyond is dropped.
+    """
+    flat = flattened(settings)
+    loggers = []
+    for kind in kinds:
+        logger = LOGGERS[kind](folder, project, uri, every, first_step)
+        if first_step == 0 or kind != "mlflow":  # which takes each setting once
+            logger.log_hyperparams(flat)
+        loggers.append(logger)
+    return loggers
+
+
+def _tensorboard(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
+    return TensorBoardLogger(
+        folder, name="", version="tensorboard", default_hp_metric=False, purge_step=first
+    )
+
+
+def _csv(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
+    file = folder / "csv" / "metrics.csv"
+    earlier = []
+    if first and file.is_file():
+        with file.open(newline="") as stream:
+            earlier = [row for row in csv.DictReader(stream) if int(row["step"]) < first]
+    file.unlink(missing_ok=True)
+    logger = CSVLogger(folder, name="", version="csv", flush_logs_every_n_steps=every)
+    for row in earlier:
+        step = int(row.pop("step"))
+        logger.log_metrics({name: float(value) for name, value in row.items() if value}, step)
+    logger.save()
+    return logger
+
+
+def _wandb(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
+    known = _identity(folder).get("wandb")
+    logger = WandbLogger(project=project, name=folder.name, id=known, save_dir=folder)
+    _identify(folder, wandb=logger.experiment.id)
+    return logger
+
+
+def _mlflow(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
+    place = uri or os.environ.get("MLFLOW_TRACKING_URI") or Path("mlruns").absolute().as_uri()
+    known = _identity(folder).get("mlflow")
+    logger = MLFlowLogger(project, run_name=folder.name, run_id=known, tracking_uri=place)
+    _identify(folder, mlflow=logger.run_id)
+    return logger
+
+
+LOGGERS: dict[str, Callable[[Path, str, str | None, int, int], Logger]] = {
+    "tensorboard": _tensorboard,
+    "csv": _csv,
+    "wandb": _wandb,
+    "mlflow": _mlflow,
+}
+
+# packages that do not come with nsm
+_EXTERNAL = ("wandb", "mlflow")
+
+
+def require(kind: str) -> None:
+    """NsmError for a logger whose package is not there; told before any work is done."""
+    if kind in _EXTERNAL and importlib.util.find_spec(kind) is None:
+        raise NsmError(f"logger={kind}: the package {kind} is not installed; pip install {kind}")
+
+
+def _identity(folder: Path) -> dict[str, Any]:
+    file = folder / IDENTITY_FILE
+    return json.loads(file.read_text()) if file.is_file() else {}
+
+
+def _identify(folder: Path, **words: Any) -> None:
+    atomic_write(folder / IDENTITY_FILE, as_json({**_identity(folder), **words}))
+
+
+def log_picture(loggers: Sequence[Logger], name: str, image: np.ndarray, step: int) -> None:
+    """Put a picture (H, W, 3) uint8 into the logs that take pictures."""
+    for logger in loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_image(name, image, step, dataformats="HWC")
+        elif isinstance(logger, WandbLogger):
+            logger.log_image(name, [image], step)
+        elif isinstance(logger, MLFlowLogger):
+            picture = Image.fromarray(image)
+            logger.experiment.log_image(logger.run_id, picture, f"{name}/{step:07d}.png")
+
+
+def log_figures(
+    loggers: Sequence[Logger], settings: Mapping[str, Any], metrics: Mapping[str, Any], step: int
+) -> None:
+    """Put a run's final figures into its logs, beside its settings, and close them.
+
+    TensorBoard has them as a run of its own, ``figures``, so that its HPARAMS tab compares runs by
+    these alone.
+    """
+    figures = {f"figures/{name}": value for name, value in headline(metrics).items()}
+    for logger in loggers:
+        if isinstance(logger, TensorBoardLogger):
+            _compare(Path(logger.log_dir) / "figures", flattened(settings), figures, step)
+        else:
+            logger.log_metrics(figures, step)
+    close(loggers, "success")
+
+
+def close(loggers: Sequence[Logger], status: str) -> None:
+    """Bring everything to its place; a W&B run would else go on into the next one of a sweep."""
+    for logger in loggers:
+        logger.finalize(status)
+        if isinstance(logger, WandbLogger):
+            logger.experiment.finish(exit_code=0 if status == "success" else 1)
+
+
+def _compare(folder: Path, flat: dict[str, Any], figures: dict[str, float], step: int) -> None:
+    from torch.utils.tensorboard import SummaryWriter
+    from torch.utils.tensorboard.summary import hparams
+
+    shutil.rmtree(folder, ignore_errors=True)  # of the same run, resumed after its end
+    # no experiment summary: TensorBoard takes the first that it finds for all runs, while without
+    # one it unites the settings and figures of all
+    _, start, end = hparams(flat, figures)
+    with SummaryWriter(folder) as writer:
+        file = writer._get_file_writer()
+        file.add_summary(start)
+        file.add_summary(end)
+        for name, value in figures.items():
+            writer.add_scalar(name, value, step)
+
+
+def headline(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """A run's figures as one row.
+
+    Those of a parameterisation are its own, without the methods it is compared with; those of a
+    collection are the worst over its pairs.
+    """
+    row = {k: float(v) for k, v in metrics.items() if isinstance(v, (int, float))}
+    row.update(metrics.get("nsm", {}))
+    pairs = list(metrics.get("pairs", {}).values())
+    for name in pairs[0] if pairs else ():
+        worst = min if name == "covered_percent" else max
+        row[f"{name}_worst"] = worst(pair[name] for pair in pairs)
+    return {name: value for name, value in row.items() if math.isfinite(value)}
+
+
+def flattened(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings with dotted names; lists, and what has no value, as text."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            flat.update(flattened(value, f"{name}."))
+        else:
+            flat[name] = value if isinstance(value, (bool, int, float, str)) else str(value)
+    return flat

@@ -1,0 +1,157 @@
+"""Logs of a run: what is in them, after resuming too, and how TensorBoard compares runs."""
+
+import csv
+import importlib.util
+import json
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tensorboard import program
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import nsm
+from nsm.config import compose_config
+from nsm.errors import NsmError
+from nsm.pipeline import run_overfit
+
+QUICK = ["experiment=quick", "data.held_out=512", "logger.every=5", "trainer.progress=false"]
+TINY = [*QUICK, "data.batch_size=64", "data.steps_per_epoch=10", "trainer.max_steps=20"]
+
+
+def overfitted(folder: Path, *words: str):
+    surface = nsm.Surface.load("plane", cache=False)
+    return nsm.overfit(surface, overrides=[*TINY, *words], folder=folder, progress=False)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs of one sweep, with all logs on the disk."""
+    folder = tmp_path_factory.mktemp("runs")
+    words = ["logger=both", "logger.pictures=1", "data.vertex_share=0"]
+    for rate in (0.001, 0.002):
+        overfitted(folder / str(rate), f"optimizer.lr={rate}", *words)
+    return folder
+
+
+def events(folder: Path) -> EventAccumulator:
+    return EventAccumulator(str(folder)).Reload()
+
+
+def test_weighted_terms_add_up_to_the_loss(runs):
+    board = events(runs / "0.001" / "tensorboard")
+    values = {k: [e.value for e in board.Scalars(k)] for k in board.Tags()["scalars"]}
+    assert len(values["train/loss"]) == 4
+    total = np.add(values["weighted/position"], values["weighted/normal"])
+    np.testing.assert_allclose(total, values["train/loss"], rtol=1e-5)
+    ratio = np.divide(values["weighted/normal"], values["train/normal"])
+    np.testing.assert_allclose(ratio, 0.01, rtol=1e-5)
+    assert {"train/gradient_norm", "val/rms_percent"} <= set(values)
+    assert min(values["train/samples_per_second"]) > 64
+    # at step 4 of 20: risen by 5/101 in the warmup, and 0.2 of the half-wave down
+    expected = 0.001 * 5 / 101 * 0.5 * (1 + np.cos(0.2 * np.pi))
+    np.testing.assert_allclose(values["learning_rate/network"][0], expected, rtol=1e-4)
+    assert values["learning_rate/encoding"][0] > values["learning_rate/network"][0]
+
+
+def test_the_table_holds_the_same_curves(runs):
+    board = events(runs / "0.001" / "tensorboard")
+    with (runs / "0.001" / "csv" / "metrics.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["train/loss"]]
+    expected = {e.step: e.value for e in board.Scalars("train/loss")}
+    assert {int(r["step"]): float(r["train/loss"]) for r in rows} == pytest.approx(expected)
+
+
+def test_tensorboard_compares_runs_by_their_final_figures(runs):
+    board = program.TensorBoard()
+    board.configure(argv=[None, "--logdir", str(runs), "--port", "0", "--load_fast=false"])
+    place = f"{board.launch()}data/plugin/hparams"
+
+    def ask(what: str, **words):
+        data = json.dumps({"experimentName": "", **words}).encode()
+        head = {"Content-Type": "application/json"}
+        with urllib.request.urlopen(urllib.request.Request(f"{place}/{what}", data, head)) as page:
+            return json.load(page)
+
+    deadline = time.monotonic() + 30
+    while len((found := ask("experiment")).get("hparamInfos", ())) == 0:
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+    groups = ask("session_groups", allowedStatuses=["STATUS_SUCCESS"], sliceSize=10)
+    assert {m["name"]["tag"].split("/")[0] for m in found["metricInfos"]} == {"figures"}
+    rows = {group["hparams"]["optimizer.lr"]: group for group in groups["sessionGroups"]}
+    assert set(rows) == {0.001, 0.002}
+    for rate, group in rows.items():
+        stored = json.loads((runs / str(rate) / "metrics.json").read_text())["metrics"]
+        shown = {v["name"]["tag"]: v["value"] for v in group["metricValues"]}
+        assert shown["figures/rms_percent"] == pytest.approx(stored["rms_percent"], rel=1e-5)
+
+
+def test_a_resumed_run_goes_on_in_the_same_logs(tmp_path):
+    config = compose_config(["task=overfit", *TINY, "logger=both", "artefacts=false"])
+    surface = nsm.Surface.load("plane", cache=False)
+    for resuming, steps in ((False, 20), (True, 30)):
+        config.trainer.max_steps = steps
+        run_overfit(config, tmp_path, surface, resuming=resuming)
+    with (tmp_path / "csv" / "metrics.csv").open() as stream:
+        steps = [int(row["step"]) for row in csv.DictReader(stream) if row["train/loss"]]
+    assert steps == [4, 9, 14, 19, 24, 29]
+    board = events(tmp_path / "tensorboard")
+    assert [e.step for e in board.Scalars("train/loss")] == steps
+
+
+def test_what_was_logged_beyond_the_checkpoint_is_dropped(tmp_path):
+    overfitted(tmp_path, "logger=both", "artefacts=false")
+    file = tmp_path / "csv" / "metrics.csv"
+    header = file.read_text().splitlines()[0].split(",")
+    with file.open("a") as stream:  # as if it had been killed at step 25, after this
+        stray = csv.DictWriter(stream, header)
+        stray.writerow({**dict.fromkeys(header, ""), "step": 24, "train/loss": 77.0})
+    config = compose_config(["task=overfit", *TINY, "logger=both", "artefacts=false"])
+    config.trainer.max_steps = 30
+    run_overfit(config, tmp_path, nsm.Surface.load("plane", cache=False), resuming=True)
+    with file.open() as stream:
+        rows = {int(r["step"]): r["train/loss"] for r in csv.DictReader(stream) if r["train/loss"]}
+    assert sorted(rows) == [4, 9, 14, 19, 24, 29] and float(rows[24]) < 77
+
+
+@pytest.mark.parametrize("kind", ["wandb", "mlflow"])
+def test_a_logger_that_is_not_installed_is_told_before_any_work(kind, monkeypatch, here, tmp_path):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *a: None if name == kind else found(name, *a)
+    )
+    result = here("surface=plane", f"logger={kind}")
+    assert result.returncode == 2
+    assert result.stderr.strip() == (
+        f"nsm: logger={kind}: the package {kind} is not installed; pip install {kind}"
+    )
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+def test_a_logger_that_is_not_known_is_refused():
+    with pytest.raises(NsmError, match="'csvv'.*csv"):
+        compose_config(["logger.kinds=[csvv]"])
+
+
+def test_wandb_keeps_a_run_offline(tmp_path, monkeypatch):
+    pytest.importorskip("wandb", reason="wandb is not installed")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    overfitted(tmp_path, "logger=wandb", "artefacts=false")
+    assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
+    assert json.loads((tmp_path / "logger.json").read_text())["wandb"]
+
+
+def test_mlflow_stores_curves_and_figures(tmp_path):
+    mlflow = pytest.importorskip("mlflow", reason="mlflow is not installed")
+    store = f"sqlite:///{tmp_path}/mlflow.db"
+    phi = overfitted(tmp_path / "run", "logger=mlflow", f"logger.uri={store}", "artefacts=false")
+    run_id = json.loads((tmp_path / "run" / "logger.json").read_text())["mlflow"]
+    client = mlflow.tracking.MlflowClient(store)
+    run = client.get_run(run_id)
+    assert run.data.params["optimizer.lr"] == "0.003" and run.info.status == "FINISHED"
+    figure = run.data.metrics["figures/rms_percent"]
+    assert figure == pytest.approx(phi.metrics["rms_percent"], rel=1e-5)
+    assert len(client.get_metric_history(run_id, "train/loss")) == 4
