@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench bench-maps bench-activation clean
+.PHONY: demo test check bench bench-maps bench-activation torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -26,6 +26,18 @@ bench-maps: .venv/.nsm-dev
 # Each activation in one network, its wrinkles, and a report on the runs: half an hour.
 bench-activation: .venv/.nsm-dev
 	$(BIN)/python benchmarks/activation.py $(if $(MESHES),--meshes $(MESHES))
+
+# The command on hostile meshes, files and disks: about half an hour on two cores.
+torture: .venv/.nsm-dev
+	$(BIN)/python benchmarks/torture
+
+# Each reader of files is fuzzed for so many seconds.
+FUZZ_SECONDS ?= 60
+FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks surface map pair collection
+fuzz: .venv/.nsm-dev
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[fuzz]'
+	for target in $(FUZZ_TARGETS); do \
+	  $(BIN)/python benchmarks/fuzz.py $$target $(FUZZ_SECONDS) || exit 1; done
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -10,6 +10,7 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,23 @@ def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
         ) from error
     check_arrays(vertices, faces, str(file))
     return vertices, faces, tuple(log)
+
+
+def as_arrays(vertices: Any, faces: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices as float64 and faces as int64; NsmError for what is no real, or no whole, number."""
+    try:
+        vertices, given = np.asarray(vertices), np.asarray(faces)
+        if vertices.dtype.kind not in "fiub" or given.dtype.kind not in "fiub":
+            raise ValueError
+        with np.errstate(invalid="ignore"):
+            faces = given.astype(np.int64)
+        if not np.array_equal(faces, given):
+            raise ValueError
+    except (TypeError, ValueError) as error:
+        raise NsmError(
+            f"{name}: vertices must be real numbers (V, 3), and faces whole ones (F, 3)"
+        ) from error
+    return vertices.astype(np.float64), faces
 
 
 def check_arrays(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:

@@ -17,7 +17,7 @@ from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.cutting import Cut, cut_to_disc
-from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.parameterization import (
     DOMAIN_AREA,
     DOMAINS,
@@ -130,6 +130,7 @@ class Surface:
                 f"{name}: unknown parameterization '{parameterization}'; "
                 f"use one of {', '.join(METHODS)}"
             )
+        vertices, faces = as_arrays(vertices, faces, name)
         seam = None if seam_vertices is None else [int(v) for v in seam_vertices]
         options = {"domain": domain, "seam": seam, "method": parameterization}
         key = cache_.preparation_key(vertices, faces, options) if cache else ""

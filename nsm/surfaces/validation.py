@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.loading import check_arrays
+from nsm.surfaces.loading import as_arrays, check_arrays
 
 # Loose parts below these shares of the area (each, and together) are debris or trimmings, such as
 # eyeballs behind a face, and are dropped; above, which part is meant is the user's to say.
@@ -47,8 +47,7 @@ class CleanMesh:
 
 def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanMesh:
     """Repair what can be repaired without changing the shape; NsmError for the rest."""
-    vertices = np.asarray(vertices, dtype=np.float64)
-    faces = np.asarray(faces, dtype=np.int64)
+    vertices, faces = as_arrays(vertices, faces, name)
     check_arrays(vertices, faces, name)
     _check_size(vertices, faces, name)
     log: list[str] = []

@@ -1,0 +1,58 @@
+"""Fuzz what reads files, guided by coverage: ``make fuzz``.
+
+Each target is given bytes, mutated from seeds and from the cases in tests/corpus, and may raise
+NsmError alone. What makes it raise anything else is left in the folder ``crashes``; once mended, it
+belongs into tests/corpus, whose files tests/test_corpus.py reads again.
+
+    python benchmarks/fuzz.py TARGET [SECONDS]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import atheris
+
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
+
+with atheris.instrument_imports(include=["nsm", "plyfile", "trimesh"]):
+    import corpus_targets
+    from torture.files import exported
+    from torture.shapes import tetrahedron
+
+
+def main() -> None:
+    name = sys.argv[1]
+    seconds = sys.argv[2] if len(sys.argv) > 2 else "60"
+    target = corpus_targets.TARGETS[name]
+    crashes = ROOT / "crashes"
+    crashes.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as seeds:
+        if name in corpus_targets.MESHES:
+            forms = {"ply": ("ply", "binary.ply"), "stl": ("stl", "binary.stl")}.get(name, (name,))
+            for form in forms:
+                (Path(seeds) / form).write_bytes(exported(tetrahedron(), form))
+        elif name == "config":
+            (Path(seeds) / "config").write_bytes((ROOT / "conf" / "config.yaml").read_bytes())
+        for file in (ROOT / "tests" / "corpus" / name).glob("*"):
+            (Path(seeds) / file.name).write_bytes(file.read_bytes())
+        atheris.Setup(
+            [
+                sys.argv[0],
+                seeds,
+                f"-max_total_time={seconds}",
+                f"-artifact_prefix={crashes}/{name}-",
+                "-max_len=4096",
+                "-timeout=20",
+                "-rss_limit_mb=3000",
+            ],
+            target,
+        )
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""What a run leaves, looked at from outside: is it whole, finite, injective and near the mesh?"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image
+from safetensors.numpy import load_file
+
+import nsm
+
+# φ after the few steps of a trial may be this far from the mesh, in percent of the diagonal (RMS)
+NEAR_PERCENT = 15.0
+_ROUNDING = 1e-9
+
+
+def complaints(folder: Path, task: str, mesh: tuple[np.ndarray, np.ndarray]) -> list[str]:
+    """Everything that is wrong with the folder of a finished run; nothing if it is right."""
+    found = [*_files(folder)]
+    if not (folder / "metrics.json").exists():
+        return [*found, "no metrics.json"]
+    surfaces = sorted(folder.rglob("surface.json"))
+    if not surfaces:
+        return [*found, "no surface.json"]
+    for k, file in enumerate(surfaces):
+        found += _surface(file.parent, mesh if k == 0 and task != "pair_map" else None)
+    if task == "overfit":
+        found += _reconstruction(folder)
+    return found
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """Files that are half written, or that hold values which are not finite."""
+    for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+        name = file.relative_to(folder)
+        if file.suffix == ".tmp" or file.stat().st_size == 0:
+            yield f"{name}: half written"
+            continue
+        try:
+            arrays = _arrays(file)
+        except Exception as error:  # whatever the readers of ten formats raise
+            yield f"{name}: unreadable ({type(error).__name__}: {error})"
+            continue
+        for array in arrays:
+            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+                yield f"{name}: not finite"
+                break
+
+
+def _arrays(file: Path) -> list[np.ndarray]:
+    """The numbers in a file."""
+    if file.suffix == ".safetensors":
+        return list(load_file(file).values())
+    if file.suffix == ".json":
+        return [np.array(_numbers(json.loads(file.read_text())), dtype=float)]
+    if file.suffix in (".obj", ".glb"):
+        loaded = trimesh.load(file, process=False, force="mesh")
+        uv = getattr(loaded.visual, "uv", None)
+        return [np.asarray(loaded.vertices)] + ([] if uv is None else [np.asarray(uv)])
+    if file.suffix in (".png", ".gif"):
+        with Image.open(file) as picture:
+            picture.load()
+        return []
+    if file.suffix == ".npy":
+        return [np.load(file, allow_pickle=False)]
+    if file.suffix == ".ckpt":
+        return list(_tensors(torch.load(file, weights_only=True, map_location="cpu")))
+    return []
+
+
+def _numbers(words: Any) -> list[float]:
+    """All numbers of a JSON file; null, which stands for a figure that is no number, as NaN.
+
+    Settings may well be null: they are left out.
+    """
+    if isinstance(words, dict):
+        return [x for key, value in words.items() if key != "config" for x in _numbers(value)]
+    if isinstance(words, list):
+        return [x for value in words for x in _numbers(value)]
+    if words is None:
+        return [math.nan]
+    return [float(words)] if isinstance(words, (int, float)) else []
+
+
+def _tensors(state: Any) -> Iterator[np.ndarray]:
+    if isinstance(state, torch.Tensor):
+        yield state.detach().numpy()
+    elif isinstance(state, dict):
+        for value in state.values():
+            yield from _tensors(value)
+    elif isinstance(state, (list, tuple)):
+        for value in state:
+            yield from _tensors(value)
+
+
+def _surface(folder: Path, mesh: tuple[np.ndarray, np.ndarray] | None) -> Iterator[str]:
+    """Whether a saved surface is a disc, injective in Ω, and made of the vertices of the mesh."""
+    arrays = load_file(folder / "surface.safetensors")
+    about = json.loads((folder / "surface.json").read_text())["surface"]
+    faces, uv, vertices = (arrays[f"surface.{key}"] for key in ("faces", "uv", "vertices"))
+    area = math.pi if about["domain"] == "disc" else 4.0
+    yield from disc(faces)
+    yield from injective(faces, uv, about["domain"])
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    total = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    if not math.isclose(total, area, rel_tol=1e-6):
+        yield f"its area is {total}, not that of the domain"
+    if mesh is not None:
+        source = arrays["surface.source_vertex"]
+        known = source >= 0
+        back = vertices[known] / about["scale"] + arrays["surface.center"]
+        given = mesh[0][source[known]]
+        size = np.abs(mesh[0][np.unique(mesh[1])]).max()
+        if np.abs(back - given).max() > 1e-6 * size:
+            yield "its vertices are not those of the mesh"
+
+
+def disc(faces: np.ndarray) -> Iterator[str]:
+    """Complaints unless the triangles are an oriented disc: one piece, one boundary, no handle."""
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    if len(np.unique(directed, axis=0)) != len(directed):
+        yield "an edge is run along twice in one direction"
+        return
+    edges, count = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
+    euler = len(np.unique(faces)) - len(edges) + len(faces)
+    if euler != 1 or count.max() > 2:
+        yield f"Euler characteristic {euler}, not that of a disc"
+    if trimesh.graph.connected_component_labels(edges).max() != 0:
+        yield "more than one piece"
+    rim = boundary(faces)
+    if rim is None:
+        yield "its boundary is not one loop"
+
+
+def boundary(faces: np.ndarray) -> np.ndarray | None:
+    """The boundary vertices in order; None unless they are one loop that meets each once."""
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    key = np.sort(directed, axis=1)
+    _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    rim = directed[count[inverse.ravel()] == 1]
+    following = dict(rim.tolist())
+    if len(following) != len(rim) or not following:
+        return None
+    start = next(iter(following))
+    loop = [start]
+    while (vertex := following[loop[-1]]) != start:
+        loop.append(vertex)
+        if len(loop) > len(rim):
+            return None
+    return np.array(loop) if len(loop) == len(rim) else None
+
+
+def injective(faces: np.ndarray, uv: np.ndarray, domain: str) -> Iterator[str]:
+    """Complaints unless uv maps a disc injectively into Ω.
+
+    It does if all triangles are counter-clockwise and the boundary goes once around ∂Ω, which is
+    convex, without turning back.
+    """
+    a, b, c = (uv[faces[:, k]] for k in range(3))
+    double = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    if not (double > 0).all():
+        yield f"{int((~(double > 0)).sum())} triangles of the domain are folded"
+    reach = np.linalg.norm(uv, axis=1) if domain == "disc" else np.abs(uv).max(axis=1)
+    if reach.max() > 1 + _ROUNDING:
+        yield f"a vertex is outside the domain, at {reach.max()}"
+    loop = boundary(faces)
+    if loop is None:
+        return
+    if np.abs(reach[loop] - 1).max() > _ROUNDING:
+        yield "the boundary is not on that of the domain"
+    p = uv[loop]
+    q = np.roll(p, -1, axis=0)
+    turn = np.arctan2(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0], (p * q).sum(axis=1))
+    if not (turn > 0).all() or not math.isclose(turn.sum(), 2 * math.pi, rel_tol=1e-9):
+        yield "the boundary does not go once around the domain"
+
+
+def _reconstruction(folder: Path) -> Iterator[str]:
+    """Whether φ, given back by what was saved, is near the mesh, in percent of its diagonal."""
+    phi = nsm.load(folder)
+    arrays = load_file(folder / "surface.safetensors")
+    points, vertices = phi(arrays["surface.uv"]), arrays["surface.vertices"]
+    diagonal = np.linalg.norm(np.ptp(vertices, axis=0))
+    off = 100 * math.sqrt(((points - vertices) ** 2).sum(axis=1).mean()) / diagonal
+    if not off < NEAR_PERCENT:
+        yield f"φ is {off:.1f} % of the diagonal away from the mesh"
+    written = folder / "reconstruction.obj"
+    if written.exists():
+        again = np.asarray(trimesh.load(written, process=False).vertices)
+        if again.shape != points.shape or np.abs(again - points).max() > 1e-5 * diagonal:
+            yield "the reconstruction is not φ at the mesh's vertices"
