@@ -200,7 +200,7 @@ def _with_mark(folder: Path) -> str:
 
 def _polygon(corners: int, folder: Path) -> str:
     angle = 2 * np.pi * np.arange(corners) / corners
-    lines = [f"v {np.cos(t)!r} {np.sin(t)!r} 0" for t in angle.tolist()]
+    lines = [f"v {float(np.cos(t))!r} {float(np.sin(t))!r} 0" for t in angle.tolist()]
     ring = " ".join(map(str, range(1, corners + 1)))
     return _raw("polygon.obj", "\n".join([*lines, f"f {ring}"]).encode(), folder)
 
