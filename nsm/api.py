@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from nsm.config import compose_config
 from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
+from nsm.pipeline.alone import alone
 from nsm.results import (
     NeuralSurface,
     Parameterization,
@@ -168,7 +169,9 @@ def _place(
     if not progress:
         words = [*words, "trainer.progress=false"]
     if folder is not None:
-        yield compose_config(words), Path(folder)
+        config = compose_config(words)
+        with alone(Path(folder)):
+            yield config, Path(folder)
         return
     with tempfile.TemporaryDirectory(prefix="nsm-") as temporary:
         yield compose_config([*words, "logger=none", "artefacts=false"]), Path(temporary)

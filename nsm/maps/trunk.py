@@ -72,7 +72,8 @@ class Trunk(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         layers = (len(ctx.needs_input_grad) - 4) // 2
-        parameters, tape = ctx.saved_tensors[: 2 * layers], ctx.saved_tensors[2 * layers :]
+        saved = ctx.saved_tensors  # once: checkpointed parts are computed anew by this
+        parameters, tape = saved[: 2 * layers], saved[2 * layers :]
         weights = parameters[::2]
         of_stack = gradient.new_empty(ctx.shape) if ctx.needs_input_grad[0] else None
         of_parameters: list[Tensor | None] = [None] * (2 * layers)

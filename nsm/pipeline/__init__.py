@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from nsm.config import checked, read_config
 from nsm.errors import NsmError
+from nsm.pipeline.alone import alone
 from nsm.pipeline.collection_map import run_collection_map
 from nsm.pipeline.common import CONFIG_FILE, quiet_lightning
 from nsm.pipeline.overfit import build_overfit, run_overfit
@@ -49,7 +50,8 @@ def run(config: DictConfig, folder: Path) -> None:
         config = _stored_config(folder)
     if config.task.name not in TASKS:
         raise NsmError(f"task.name={config.task.name} is not one of {', '.join(TASKS)}")
-    TASKS[config.task.name](config, folder, resuming=resuming)
+    with alone(folder):
+        TASKS[config.task.name](config, folder, resuming=resuming)
 
 
 def _stored_config(folder: Path) -> DictConfig:

@@ -21,6 +21,7 @@ from nsm.data import OverfitData
 from nsm.errors import NsmError
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
+from nsm.results.faults import Faults, faults_of
 from nsm.results.files import as_json, check_stored
 from nsm.results.loggers import build_loggers, close, log_figures
 from nsm.results.progress import TrainingProgress
@@ -128,6 +129,7 @@ def fitted(
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     callbacks: list[Callback] = [
+        Faults(console),
         GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window),
         AtomicCheckpoint(folder / CHECKPOINT_FILE),
     ]
@@ -218,6 +220,7 @@ def write_figures(
         "steps": trainer.global_step,
         "seconds": round(time.monotonic() - started, 2),
         "preparation": surface.quality,
+        "faults": faults_of(trainer),
         **figures,
     }
     atomic_write(folder / "metrics.json", as_json(words))

@@ -15,6 +15,7 @@ from pytorch_lightning.callbacks import Callback
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
+from nsm.results.files import flush_folder
 from nsm.results.loggers import log_picture
 
 
@@ -36,14 +37,24 @@ class AtomicCheckpoint(Callback):
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         temporary = self.path.with_suffix(".tmp")
-        trainer.save_checkpoint(temporary)
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
-        os.replace(temporary, self.path)
+        try:
+            trainer.save_checkpoint(temporary)
+            with temporary.open("rb") as stream:
+                os.fsync(stream.fileno())
+            os.replace(temporary, self.path)
+            flush_folder(self.path.parent)
+        except (OSError, RuntimeError) as error:  # torch has RuntimeError for a full disk
+            temporary.unlink(missing_ok=True)
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:120]
+            raise NsmError(
+                f"{self.path}: the checkpoint of step {trainer.global_step} cannot be written "
+                f"({reason}); the one before, if any, is whole. Free some space, then go on with: "
+                f"nsm resume={self.path.parent}"
+            ) from error
 
 
 class GradientWatch(Callback):
-    """Log the gradient's norm, stop by it, and refuse to go on from a loss that is not a number.
+    """Log the gradient's norm, and stop by it.
 
     Args:
         every: steps between two values in the log.
@@ -62,12 +73,9 @@ class GradientWatch(Callback):
         if not logging and self.stop_norm is None:
             return
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        if not gradients:  # taken back, as not finite (see Faults)
+            return
         norm = float(torch.nn.utils.get_total_norm(gradients))
-        if norm != norm:
-            raise NsmError(
-                f"the loss is not a number at step {trainer.global_step}; "
-                "lower optimizer.lr, or resume from the last checkpoint"
-            )
         self.recent.append(norm)
         if logging:
             pl_module.log("train/gradient_norm", norm)

@@ -54,15 +54,29 @@ def atomic_write(path: str | Path, data: bytes) -> None:
         os.umask(umask)
         os.chmod(name, 0o666 & ~umask)
         os.replace(name, target)
+        flush_folder(target.parent)
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
 
 
+def flush_folder(folder: Path) -> None:
+    """Bring a renaming to the disk, where the system can."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def write_pair(
     stem: Path, form: str, version: int, tensors: Mapping[str, Tensor], words: Mapping[str, Any]
 ) -> None:
-    """Write an artefact; its JSON last, so that a pair with both files is complete.
+    """Write an artefact, whole or not at all: the one before holds until its JSON is replaced.
+
+    The old tensors stay beside the new ones, as STEM.previous.safetensors, until then.
 
     Raises:
         OSError: the folder cannot be written.
@@ -70,8 +84,26 @@ def write_pair(
     stem.parent.mkdir(parents=True, exist_ok=True)
     data = save(dict(tensors))
     head = {"format": form, "version": version, "sha256": hashlib.sha256(data).hexdigest()}
-    atomic_write(stem.with_suffix(".safetensors"), data)
+    file, previous = stem.with_suffix(".safetensors"), _previous(stem)
+    if file.exists() and not _is_committed(stem, previous):
+        os.replace(file, previous)
+    atomic_write(file, data)
     atomic_write(stem.with_suffix(".json"), as_json({**head, **words}))
+    previous.unlink(missing_ok=True)
+
+
+def _previous(stem: Path) -> Path:
+    return stem.with_suffix(".previous.safetensors")
+
+
+def _is_committed(stem: Path, previous: Path) -> bool:
+    """Whether a writing that was cut short left the tensors that the JSON means in ``previous``."""
+    try:
+        words = json.loads(stem.with_suffix(".json").read_bytes())
+        data = previous.read_bytes()
+    except (OSError, ValueError):
+        return False
+    return isinstance(words, dict) and words.get("sha256") == hashlib.sha256(data).hexdigest()
 
 
 def as_json(words: Any) -> bytes:
@@ -105,7 +137,9 @@ def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], d
             f"{file}: version {words.get('version')}, but this nsm reads version {version}; "
             "make the run again with this nsm"
         )
-    data = _read(stem.with_suffix(".safetensors"))
+    # a writing that was cut short has left the tensors of this JSON under the other name
+    short = _is_committed(stem, _previous(stem))
+    data = _read(_previous(stem) if short else stem.with_suffix(".safetensors"))
     if hashlib.sha256(data).hexdigest() != words.get("sha256"):
         raise NsmError(
             f"{stem.with_suffix('.safetensors')}: truncated or changed (its checksum is not the "

@@ -87,6 +87,20 @@ class CollectionMap(ConstrainedMap):
     def _distortion(self, x: Tensor) -> tuple[Distortion, Tensor, Tensor]:
         """Energy of the ordered pairs at points (N, 2), all det J_h (k, N), and all h (k, N, 2)
         there."""
+        forms, determinants, everywhere = (
+            part.transpose(0, 1) for part in self.pointwise(self._at, x)
+        )
+        # samples lie by the mean of the surfaces' areas: weights make it that of each source
+        area = torch.linalg.det(forms.detach()).clamp(min=0).sqrt()
+        share = area / area.mean(dim=0).clamp(min=1e-12)
+        if self.constraints.boundary == "penalty":  # samples that went astray do not count
+            share = share * inside(self.domain, everywhere.detach()).all(dim=0)
+        i, j = self.ordered
+        parts = self.energy.parts(forms[i], forms[j])
+        return Distortion(self.energy, parts, share[i]), determinants, everywhere
+
+    def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A_i (N, k, 2, 2), det J_h (N, k) and h (N, k, 2) of all surfaces at points (N, 2)."""
         metrics, determinants, images = [], [], []
         for h, phi in zip(self.map, self.phis, strict=True):
             image, inner = h.value_and_jacobian(x)  # type: ignore[operator]
@@ -94,16 +108,7 @@ class CollectionMap(ConstrainedMap):
             metrics.append(first_fundamental_form(outer @ inner))
             determinants.append(torch.linalg.det(inner))
             images.append(image)
-        forms = torch.stack(metrics)
-        # samples lie by the mean of the surfaces' areas: weights make it that of each source
-        area = torch.linalg.det(forms.detach()).clamp(min=0).sqrt()
-        share = area / area.mean(dim=0).clamp(min=1e-12)
-        everywhere = torch.stack(images)
-        if self.constraints.boundary == "penalty":  # samples that went astray do not count
-            share = share * inside(self.domain, everywhere.detach()).all(dim=0)
-        i, j = self.ordered
-        parts = self.energy.parts(forms[i], forms[j])
-        return Distortion(self.energy, parts, share[i]), torch.stack(determinants), everywhere
+        return tuple(torch.stack(one, dim=1) for one in (metrics, determinants, images))  # type: ignore[return-value]
 
     def _seam_gap(self) -> Tensor:
         """Σ over surfaces of the mean squared distance between a seam point's two copies."""

@@ -47,8 +47,9 @@ class Overfit(Training):
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         if self.lambda_normal == 0:
-            return self.summed({"position": (1.0, self._position(self.map(batch.uv), batch))})
-        value, jacobian = self.map.value_and_jacobian(batch.uv)
+            (value,) = self.pointwise(lambda uv: (self.map(uv),), batch.uv)
+            return self.summed({"position": (1.0, self._position(value, batch))})
+        value, jacobian = self.pointwise(self.map.value_and_jacobian, batch.uv)
         turn = normal(jacobian, batch.normals).mean()
         terms = {
             "position": (1.0, self._position(value, batch)),

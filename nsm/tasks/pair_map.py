@@ -85,15 +85,20 @@ class PairMap(ConstrainedMap):
 
     def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor, Tensor]:
         """Energy at points (N, 2) of Ω, det J_h (N,) and h (N, 2) there."""
-        with torch.no_grad():
-            source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
-        image, jacobian = self.map.value_and_jacobian(uv)
-        _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
-        parts = self.energy.parts(source, first_fundamental_form(outer @ jacobian))
+        source, target, jacobian, image = self.pointwise(self._at, uv)
+        parts = self.energy.parts(source, target)
         if self.constraints.boundary == "penalty":  # samples that went astray do not count
             kept = inside(self.domain, image)
             parts = {name: part[kept] for name, part in parts.items()}
         return Distortion(self.energy, parts), torch.linalg.det(jacobian), image
+
+    def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """A, B, J_h and h at points (N, 2) of Ω."""
+        with torch.no_grad():
+            source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
+        image, jacobian = self.map.value_and_jacobian(uv)
+        _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
+        return source, first_fundamental_form(outer @ jacobian), jacobian, image
 
     def _seam_gap(self) -> Tensor:
         """Mean squared distance on the target between the images of a seam point's two copies."""

@@ -85,11 +85,14 @@ class Param(Training):
 
     def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor]:
         """Energy at points (N, 2) of Ω, and det J_h (N,) there; φ's work is not recorded."""
-        with torch.no_grad():
-            source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
-        _, jacobian = self.map.value_and_jacobian(uv)
+        source, jacobian = self.pointwise(self._at, uv)
         parts = self.energy.parts(source, first_fundamental_form(jacobian))
         return Distortion(self.energy, parts), torch.linalg.det(jacobian)
+
+    def _at(self, uv: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
+        return source, self.map.value_and_jacobian(uv)[1]
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import pytorch_lightning as pl
 from torch import Tensor
 
+from nsm.tasks.splitting import Splitting
 from nsm.tasks.terms import Term
 
 
-class Training(pl.LightningModule):
+class Training(Splitting):
     """Base of the tasks.
 
     Attributes:

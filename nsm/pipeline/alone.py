@@ -1,0 +1,39 @@
+"""One run in a folder at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from nsm.errors import NsmError
+
+LOCK_FILE = ".lock"
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a run folder, which is made if need be; the operating system lets go of it when the
+    process ends, however that happens.
+
+    Raises:
+        NsmError: another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise NsmError(
+            f"{folder}: another run is at work there; wait for its end, or give another folder"
+        ) from None
+    try:
+        yield
+    finally:
+        if [entry.name for entry in folder.iterdir()] == [LOCK_FILE]:
+            lock.release(force=True)  # nothing came of it: leave an empty folder, as found
+            (folder / LOCK_FILE).unlink(missing_ok=True)
+        else:
+            lock.release(force=True)

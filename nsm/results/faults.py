@@ -1,0 +1,139 @@
+"""What is done about a training that goes wrong."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from pytorch_lightning.callbacks import Callback
+from rich.console import Console
+from torch import Tensor
+from torch.optim import Optimizer
+
+from nsm.errors import NsmError
+
+_EVERY = 50  # steps between two states that are kept
+_TRIES = 5
+_SMALLER = 0.5
+
+
+class Faults(Callback):
+    """Roll back a step whose loss or gradient is not finite, and go on with smaller steps.
+
+    A state is kept in memory, and in the checkpoint, every few steps, once the loss and gradient
+    there are known to be finite. The step that fails changes nothing: weights, optimiser and
+    buffers return to the kept state, and all learning rates are halved.
+
+    Args:
+        console: where each fault is told, in one line.
+
+    Attributes:
+        rollbacks: {step, back_to} of each, for metrics.json.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.good: dict[str, Any] | None = None
+        self.rollbacks: list[dict[str, int]] = []
+        self.loss: Tensor | None = None
+        self.parts = 1
+
+    def on_before_backward(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, loss: Tensor
+    ) -> None:
+        self.loss = loss.detach()
+
+    def on_before_optimizer_step(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer
+    ) -> None:
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients)
+        if bool(torch.isfinite(norm)) and (self.loss is None or bool(torch.isfinite(self.loss))):
+            if self.good is None or trainer.global_step % _EVERY == 0:
+                self._keep(trainer.global_step, pl_module, optimizer)
+            return
+        self._roll_back(trainer, pl_module, optimizer)
+
+    def _keep(self, step: int, module: pl.LightningModule, optimizer: Optimizer) -> None:
+        frozen = {name for name, p in module.named_parameters() if not p.requires_grad}
+        state = module.state_dict()
+        self.good = {
+            "step": step,
+            "module": {k: v.detach().clone() for k, v in state.items() if k not in frozen},
+            "optimizer": copy.deepcopy(optimizer.state_dict()),
+        }
+
+    def _roll_back(
+        self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: Optimizer
+    ) -> None:
+        step = trainer.global_step
+        if self.good is None:
+            raise NsmError(
+                f"the loss or its gradient is not finite at the first step, {step}; check the "
+                "weights of the energies and the numbers in the mesh"
+            )
+        if len(self.rollbacks) >= _TRIES:
+            raise NsmError(
+                f"the loss or its gradient is not finite at step {step}, after {_TRIES} returns to "
+                "a good state with smaller steps; lower optimizer.lr, or set trainer.gradient_clip"
+            )
+        self._restore(module)
+        optimizer.load_state_dict(copy.deepcopy(self.good["optimizer"]))
+        for configured in trainer.lr_scheduler_configs:
+            scheduler: Any = configured.scheduler
+            scheduler.base_lrs = [_SMALLER * rate for rate in scheduler.base_lrs]
+        # optimisers pass over parameters without a gradient: momentum moves nothing either
+        for p in module.parameters():
+            p.grad = None
+        self.rollbacks.append({"step": step, "back_to": self.good["step"]})
+        self.console.print(
+            f"step {step}: the loss or its gradient is not finite; back to the state of step "
+            f"{self.good['step']}, with steps half as long ({len(self.rollbacks)} of {_TRIES})",
+            soft_wrap=True,
+        )
+
+    def _restore(self, module: pl.LightningModule) -> None:
+        assert self.good is not None
+        module.load_state_dict(self.good["module"], strict=False)
+
+    def on_train_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        parts = getattr(pl_module, "parts", 1)
+        if parts != self.parts:
+            self.parts = parts
+            self.console.print(
+                f"step {trainer.global_step}: out of memory; batches are evaluated in {parts} parts"
+            )
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """The last update has no step after it that would find it out."""
+        trained = [p for p in pl_module.parameters() if p.requires_grad]
+        if self.good is None or all(bool(torch.isfinite(p).all()) for p in trained):
+            return
+        self._restore(pl_module)
+        self.rollbacks.append({"step": trainer.global_step, "back_to": self.good["step"]})
+        self.console.print(f"the last step was not finite; back to step {self.good['step']}")
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"good": self.good, "rollbacks": self.rollbacks, "parts": self.parts}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.good, self.rollbacks = state_dict["good"], list(state_dict["rollbacks"])
+        self.parts = state_dict["parts"]
+
+
+def faults_of(trainer: pl.Trainer) -> dict[str, Any]:
+    """What metrics.json says of a training's faults: rollbacks, and parts of a batch."""
+    watch = next((c for c in trainer.callbacks if isinstance(c, Faults)), None)  # type: ignore[attr-defined]
+    return {
+        "rollbacks": [] if watch is None else watch.rollbacks,
+        "batch_parts": getattr(trainer.lightning_module, "parts", 1),
+    }
