@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench bench-maps bench-activation torture fuzz clean
+.PHONY: demo test check bench bench-maps bench-activation bench-speed torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -38,6 +38,10 @@ fuzz: .venv/.nsm-dev
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[fuzz]'
 	for target in $(FUZZ_TARGETS); do \
 	  $(BIN)/python benchmarks/fuzz.py $$target $(FUZZ_SECONDS) || exit 1; done
+
+# Cost of a step and time to an error, ours beside the published recipe and settings: ten minutes.
+bench-speed: .venv/.nsm-dev
+	$(BIN)/python benchmarks/speed.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -1,0 +1,560 @@
+"""What a training step costs, and how soon a training is where it should be.
+
+Sides that are compared run in turn, round by round, and medians are taken. On a CPU, time is CPU
+time of the process (its threads together), so that other programs disturb little; on a GPU it is
+the clock, synchronised. The GPU is used where there is one.
+
+    python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import published
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+
+from nsm.config import compose_config
+from nsm.data import OverfitData, Samples
+from nsm.energies.overfit import position
+from nsm.maps import NeuralMap, build_map
+from nsm.pipeline import build_overfit
+from nsm.pipeline.collection_map import build_collection_map
+from nsm.pipeline.pair_map import build_pair_map
+from nsm.pipeline.param import build_param
+from nsm.results import NeuralSurface, atomic_write
+from nsm.surfaces import Surface
+from nsm.surfaces.shapes import ring_mesh
+from nsm.surfaces.together import matched_landmarks
+from nsm.tasks.weakest import Weakest
+
+RESULTS = Path(__file__).parent / "results"
+PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
+TASKS = ("overfit", "param", "pair_map", "collection_map")
+SETTINGS = ("paper", "default")
+ERRORS = (1.0, 0.5, 0.2, 0.1)  # RMS in percent of the diagonal
+SHARES = (0.5, 0.8, 0.9, 0.95)  # of the way from the domain's distortion to the least one found
+SURFACES = 3
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+Step = Callable[[], None]
+
+
+def clock() -> float:
+    if DEVICE.type == "cuda":
+        torch.cuda.synchronize()
+        return time.perf_counter()
+    return time.process_time()
+
+
+def in_turn(sides: dict[str, Step], rounds: int) -> dict[str, float]:
+    """Median seconds of each side; they take turns, after one round that does not count."""
+    taken: dict[str, list[float]] = {name: [] for name in sides}
+    for _ in range(rounds + 1):
+        for name, step in sides.items():
+            start = clock()
+            step()
+            taken[name].append(clock() - start)
+    return {name: median(values[1:]) for name, values in taken.items()}
+
+
+def dome(rings: int = 30, height: float = 0.5) -> Surface:
+    """A bulging disc."""
+    uv, faces = ring_mesh(rings)
+    vertices = np.column_stack([uv, height * (1 - (uv**2).sum(axis=1))])
+    return Surface(
+        name="dome",
+        vertices=vertices,
+        faces=faces,
+        uv=uv,
+        domain="disc",
+        source_vertex=np.arange(len(uv)),
+        twins=np.zeros((0, 2), dtype=np.int64),
+        scale=1.0,
+        center=np.zeros(3),
+    )
+
+
+def config_of(task: str, settings: str) -> DictConfig:
+    """The task's configuration; the paper's for maps is that of its pair maps."""
+    words = [f"task={task}", "seed=0"]
+    if settings == "paper":
+        words += ["experiment=paper" if task == "overfit" else "experiment=paper_pair"]
+        if task == "param":
+            words += ["constraints=param", "constraints.lambda_triangles=0"]
+    return compose_config(words)
+
+
+def frozen_surface(settings: str, surface: Surface) -> NeuralSurface:
+    """A network of the settings that is taken for the surface: untrained, which costs as much."""
+    module = build_overfit(config_of("overfit", settings), surface)
+    return NeuralSurface(surface, module.map.eval().requires_grad_(False).to(DEVICE))
+
+
+def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]:
+    """Loss and gradient of one step, ours and the published recipe's, of the same networks."""
+    config, surface = config_of(task, settings), dome()
+    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+    data.trainer = None
+    data.setup()
+    batch = Samples(*(part.to(DEVICE) for part in data.batch(0)))
+    phis = [frozen_surface(settings, surface) for _ in range(k)] if task != "overfit" else []
+    none = [np.zeros(0, dtype=np.int64)] * k
+    module: Any
+    if task == "overfit":
+        module = build_overfit(config, surface).to(DEVICE)
+
+        def theirs() -> Tensor:
+            return published.overfit(module.map, *batch)
+
+    elif task == "param":
+        module = build_param(config, phis[0]).to(DEVICE)
+
+        def theirs() -> Tensor:
+            return published.param(phis[0].map, module.map, batch.uv)
+
+    elif task == "pair_map":
+        pair = matched_landmarks([surface] * 2, none[:2])
+        module = build_pair_map(config, phis[0], phis[1], pair).to(DEVICE)
+
+        def theirs() -> Tensor:
+            return published.pair_map(phis[0].map, phis[1].map, module.map, batch.uv, module.rim)
+
+    else:
+        matched = matched_landmarks([surface] * k, none)
+        module = build_collection_map(config, phis, matched)[0].to(DEVICE)
+
+        def theirs() -> Tensor:
+            return published.collection_map(
+                [p.map for p in phis], list(module.map), batch.uv, module.rim
+            )
+
+    module.note = lambda figures: None  # there is no logger here
+    given = batch.uv if task == "collection_map" else batch
+
+    def step(loss: Callable[[], Tensor]) -> Step:
+        def run() -> None:
+            module.zero_grad()
+            loss().backward()
+
+        return run
+
+    return step(lambda: module.training_step(given, 0)), step(theirs)
+
+
+def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
+    """The matrix products that value, Jacobian and gradients of a network need, and their flops."""
+    layers = [m for m in net.modules() if isinstance(m, nn.Linear)]
+    triples = [
+        tuple(torch.randn(shape, device=DEVICE) for shape in shapes)
+        for shapes in (
+            ((3 * batch, m.in_features), tuple(m.weight.shape), (3 * batch, m.out_features))
+            for m in layers
+        )
+    ]
+    bare = isinstance(net.encoding, type(build_map({"encoding": {"name": "identity"}}).encoding))
+
+    def run() -> None:
+        for a, w, _ in triples:
+            torch.mm(a, w.t())
+        for k, (a, w, g) in enumerate(triples):
+            torch.mm(g.t(), a)
+            if k or not bare:  # the points themselves need no gradient
+                torch.mm(g, w)
+
+    count = sum(a.shape[0] * w.numel() for a, w, _ in triples)
+    skipped = triples[0][0].shape[0] * triples[0][1].numel() if bare else 0
+    return run, 2.0 * (3 * count - skipped)
+
+
+def peak_rate() -> float:
+    """Flops a second of one large matrix product, the best of some."""
+    side = 2048 if DEVICE.type == "cpu" else 8192
+    a, b = torch.randn(side, side, device=DEVICE), torch.randn(side, side, device=DEVICE)
+    best = float("inf")
+    for _ in range(6):
+        start = clock()
+        torch.mm(a, b)
+        best = min(best, clock() - start)
+    return 2.0 * side**3 / best
+
+
+def costs(rounds: int) -> dict[str, Any]:
+    """(a) a step of each task beside the published recipe."""
+    found = {}
+    for settings in SETTINGS:
+        for task in TASKS:
+            ours, theirs = task_steps(task, settings)
+            taken = in_turn({"nsm": ours, "published": theirs}, rounds)
+            found[f"{task}/{settings}"] = {
+                **{f"{k}_milliseconds": 1e3 * v for k, v in taken.items()},
+                "ratio": taken["published"] / taken["nsm"],
+            }
+            print(f"{task}/{settings}", found[f"{task}/{settings}"], flush=True)
+    return found
+
+
+def share_of_peak(rounds: int) -> dict[str, Any]:
+    """(b) a step of overfitting beside its bare matrix products and the machine's best rate."""
+    found: dict[str, Any] = {"peak_gflops": peak_rate() / 1e9}
+    for settings in SETTINGS:
+        config = config_of("overfit", settings)
+        net = build_overfit(config, dome()).map
+        bare, flops = products(net, config.data.batch_size)
+        ours = task_steps("overfit", settings)[0]
+        taken = in_turn({"nsm": ours, "products": bare}, rounds)
+        found[settings] = {
+            "step_milliseconds": 1e3 * taken["nsm"],
+            "products_milliseconds": 1e3 * taken["products"],
+            "step_over_products": taken["nsm"] / taken["products"],
+            "share_of_peak": flops / taken["nsm"] / 1e9 / found["peak_gflops"],
+            "products_share_of_peak": flops / taken["products"] / 1e9 / found["peak_gflops"],
+        }
+        print(settings, found[settings], flush=True)
+    return found
+
+
+def growth(rounds: int) -> dict[str, Any]:
+    """(d) milliseconds of a step as one size changes."""
+
+    def of(net: NeuralMap, batch: int) -> Step:
+        net, x = net.to(DEVICE), 2 * torch.rand(batch, 2, device=DEVICE) - 1
+
+        def run() -> None:
+            net.zero_grad()
+            value, jacobian = net.value_and_jacobian(x)
+            (value.square().mean() + jacobian.square().mean()).backward()
+
+        return run
+
+    def made(width: int = 128, depth: int = 3) -> NeuralMap:
+        return build_map({"width": width, "depth": depth, "block": "plain"})
+
+    sides = {f"batch/{n}": of(made(), n) for n in (256, 1024, 4096, 16384)}
+    sides |= {f"width/{n}": of(made(width=n), 1024) for n in (32, 64, 128, 256, 512)}
+    sides |= {f"depth/{n}": of(made(depth=n), 1024) for n in (1, 2, 4, 8, 16)}
+    sides |= {f"surfaces/{k}": task_steps("collection_map", "paper", k)[0] for k in (2, 4, 8)}
+    found = {key: 1e3 * value for key, value in in_turn(sides, rounds).items()}
+    for rings in (30, 100, 300, 580):
+        surface = dome(rings)
+        data = OverfitData(surface, batch_size=1024)
+        data.trainer = None
+        data.setup()
+        uv, faces = torch.as_tensor(surface.uv, dtype=torch.float32), torch.as_tensor(surface.faces)
+        weakest, h = Weakest(uv, faces).to(DEVICE), made().to(DEVICE)
+        planar = lambda x, h=h: h(x)[:, :2]  # noqa: E731
+
+        def fifty(data: Any = data, weakest: Any = weakest, planar: Any = planar) -> None:
+            for step in range(50):  # two looks at the triangles
+                data.batch(step)
+                weakest(planar, step).backward()
+
+        found[f"mesh/{len(surface.faces)}"] = 1e3 * in_turn({"": fifty}, 2)[""] / 50
+    return found
+
+
+def _held_out(data: OverfitData) -> Samples:
+    parts = list(data.val_dataloader())
+    return Samples(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limit: float) -> float:
+    """Train until the last step, the limit or a look says so; returns the seconds, looks aside."""
+    module.note = lambda figures: None
+    parts = module.configure_optimizers()
+    optimiser, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
+    clip, spent, seen, step = config.trainer.gradient_clip, 0.0, 0.0, 0
+    module._step = 0
+    while step < config.trainer.max_steps and spent < limit:
+        start = clock()
+        optimiser.zero_grad()
+        module.training_step(data.batch(step), 0).backward()
+        if clip:
+            nn.utils.clip_grad_norm_(module.map.parameters(), clip)
+        optimiser.step()
+        schedule.step()
+        step += 1
+        module._step = step
+        spent += clock() - start
+        if look is not None and spent - seen > max(0.25, 0.02 * spent):
+            seen = spent
+            if look(spent):
+                break
+    return spent
+
+
+def times(mesh: str, limit: float) -> dict[str, Any]:
+    """(c) seconds until the held-out error, and then the held-out distortion, is low enough.
+
+    The default's schedule ends with its last step, so that it is trained once for each of some
+    lengths and the first good one counts; the published schedule has no end and is followed.
+    """
+    surface = Surface.load(mesh)
+    found: dict[str, Any] = {"surface": surface.name, "limit_seconds": limit, "overfit": {}}
+
+    def task(name: str, settings: str, steps: int | None, phi: Any = None) -> tuple[Any, ...]:
+        config = config_of(name, settings)
+        if steps is not None:
+            config.trainer.max_steps = steps
+        make = build_overfit if name == "overfit" else build_param
+        module = _stepping(make(config, phi or surface).to(DEVICE))
+        data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+        data.trainer = None
+        data.setup()
+        return config, module, data
+
+    def rms(module: Any, held: Samples) -> float:
+        with torch.no_grad():
+            squared = position(module.map(held.uv), held.points).mean()
+        return 100 * float(squared.sqrt()) / surface.bounding_box_diagonal
+
+    curves: dict[str, list[tuple[float, float]]] = {"default": [], "paper": []}
+    phi = None
+    for steps in (125, 250, 500, 1000, 2000):
+        config, module, data = task("overfit", "default", steps)
+        spent = _trained(module, data, config, None, limit)
+        curves["default"].append((spent, rms(module, _held_out(data))))
+        phi = NeuralSurface(surface, module.map.eval().requires_grad_(False))
+    config, module, data = task("overfit", "paper", None)
+    held = _held_out(data)
+    _trained(module, data, config, _follow(curves["paper"], lambda: rms(module, held)), limit)
+    for settings, curve in curves.items():
+        found["overfit"][settings] = {
+            "seconds_to_percent": {str(e): _first(curve, e) for e in ERRORS},
+            "best_percent": min(value for _, value in curve),
+        }
+
+    def distortion(module: Any, uv: Tensor) -> float:
+        with torch.no_grad():
+            return float(module._distortion(uv)[0])
+
+    curves = {"default": [], "paper": []}
+    for steps in (25, 50, 100, 200, 400):
+        config, module, data = task("param", "default", steps, phi)
+        uv = _held_out(data).uv
+        before = distortion(module, uv)
+        spent = _trained(module, data, config, None, limit)
+        curves["default"].append((spent, distortion(module, uv)))
+    config, module, data = task("param", "paper", None, phi)
+    _trained(module, data, config, _follow(curves["paper"], lambda: distortion(module, uv)), limit)
+    least = min(value for curve in curves.values() for _, value in curve)
+    wanted = [before + share * (least - before) for share in SHARES]
+    found["param"] = {"distortion_of_domain": before, "least_distortion": least}
+    for settings, curve in curves.items():
+        found["param"][settings] = {
+            "seconds_to_distortion": {f"{w:.4g}": _first(curve, w) for w in wanted},
+            "best_distortion": min(value for _, value in curve),
+        }
+    print(json.dumps(found, indent=1), flush=True)
+    return found
+
+
+def _stepping(module: Any) -> Any:
+    """The module with a step that is counted here: there is no trainer."""
+    cls = type(module)
+    counted = property(lambda self: getattr(self, "_step", 0))
+    module.__class__ = type(cls.__name__, (cls,), {"global_step": counted})
+    return module
+
+
+def _follow(curve: list[tuple[float, float]], value: Callable[[], float]) -> Any:
+    def look(seconds: float) -> bool:
+        curve.append((seconds, value()))
+        return False
+
+    return look
+
+
+def _first(curve: list[tuple[float, float]], wanted: float) -> float | None:
+    return min((seconds for seconds, value in curve if value <= wanted), default=None)
+
+
+def memory() -> dict[str, Any]:
+    """(e) MiB that a step keeps for its backward pass, beside parameters; on a GPU, its peak."""
+    found: dict[str, Any] = {}
+    for task in TASKS:
+        both = zip(("nsm", "published"), task_steps(task, "paper"), strict=True)
+        found[task] = {f"{side}_mib": _kept(step) for side, step in both}
+        found[task]["ratio"] = found[task]["published_mib"] / found[task]["nsm_mib"]
+    return found
+
+
+def _kept(step: Step) -> float:
+    if DEVICE.type == "cuda":
+        step()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        step()
+        return (torch.cuda.max_memory_allocated() - before) / 2**20
+    storages: dict[int, int] = {}
+
+    def pack(tensor: Tensor) -> Tensor:
+        if not isinstance(tensor, nn.Parameter):
+            storage = tensor.untyped_storage()
+            storages[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        step()
+    return sum(storages.values()) / 2**20
+
+
+def page(results: dict[str, Any]) -> str:
+    """The results as a page of the documentation."""
+    on = results["machine"]
+    lines = [
+        "# Performance",
+        "",
+        f"Made by `make bench-speed` on {on['device']}, {on['threads']} thread(s), torch "
+        f"{on['torch']}, float32; {on['clock']}. Sides that are compared ran in turn; medians.",
+    ]
+    if "costs" in results:
+        lines += [
+            "",
+            "## A step of each task",
+            "",
+            "Loss and gradient, beside a plain restatement of the published recipe (one "
+            "`autograd.grad` per output, batched SVD and explicit inverse), with the same networks "
+            f"and batch. The collection has {SURFACES} surfaces.",
+            "",
+            "| task, settings | published, ms | nsm, ms | times as fast |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {key.replace('/', ', ')} | {v['published_milliseconds']:.1f} | "
+            f"{v['nsm_milliseconds']:.1f} | {v['ratio']:.2f} |"
+            for key, v in results["costs"].items()
+        ]
+    if "peak" in results:
+        lines += [
+            "",
+            "## Share of the machine's peak",
+            "",
+            "A step of overfitting beside the bare matrix products of its shapes, forward and "
+            "backward, and beside the rate of one large product "
+            f"({results['peak']['peak_gflops']:.0f} GFLOP/s).",
+            "",
+            "| settings | step, ms | products, ms | step / products | share of peak | "
+            "products' share |",
+            "|---|---|---|---|---|---|",
+        ]
+        lines += [
+            f"| {s} | {v['step_milliseconds']:.1f} | {v['products_milliseconds']:.1f} | "
+            f"{v['step_over_products']:.2f} | {100 * v['share_of_peak']:.0f} % | "
+            f"{100 * v['products_share_of_peak']:.0f} % |"
+            for s, v in results["peak"].items()
+            if s in SETTINGS
+        ]
+    if "times" in results:
+        t = results["times"]
+        limit = f"not within {t['limit_seconds']:.0f} s"
+
+        def cells(found: dict[str, float | None]) -> str:
+            return " | ".join(limit if s is None else f"{s:.1f} s" for s in found.values())
+
+        for title, of, by, best in (
+            ("RMS error, % of the diagonal", "overfit", "seconds_to_percent", "best_percent"),
+            ("distortion", "param", "seconds_to_distortion", "best_distortion"),
+        ):
+            wanted = t[of]["default"][by]
+            lines += [
+                "",
+                f"## Time to a given {title}",
+                "",
+                f"task={of} on {t['surface']}, on held-out points."
+                + (
+                    f" The domain itself has {t['param']['distortion_of_domain']:.3f}."
+                    if of == "param"
+                    else ""
+                ),
+                "",
+                "| settings | " + " | ".join(wanted) + " | best seen |",
+                "|---" * (len(wanted) + 2) + "|",
+                *(f"| {s} | {cells(t[of][s][by])} | {t[of][s][best]:.3f} |" for s in SETTINGS),
+            ]
+    if "growth" in results:
+        lines += ["", "## How a step's cost grows", "", "| what | milliseconds |", "|---|---|"]
+        groups: dict[str, list[str]] = {}
+        for key, value in results["growth"].items():
+            what, size = key.split("/")
+            groups.setdefault(what, []).append(f"{size}: {value:.1f}")
+        names = {
+            "batch": "batch, width 128, 3 layers",
+            "width": "width, batch 1,024, 3 layers",
+            "depth": "layers, batch 1,024, width 128",
+            "surfaces": "surfaces of a collection, settings of the paper",
+            "mesh": "triangles: samples and the watch on folds",
+        }
+        lines += [f"| {names[k]} | {', '.join(v)} |" for k, v in groups.items()]
+    if "memory" in results:
+        lines += [
+            "",
+            "## Memory",
+            "",
+            "What a step with the paper's settings keeps for its backward pass, MiB.",
+            "",
+            "| task | published | nsm | ratio |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {k} | {v['published_mib']:.0f} | {v['nsm_mib']:.0f} | {v['ratio']:.1f} |"
+            for k, v in results["memory"].items()
+        ]
+    return "\n".join(lines) + "\n"
+
+
+PARTS = ("costs", "peak", "growth", "memory", "times")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mesh", default="terrain", help="of the time to an error")
+    parser.add_argument("--seconds", type=float, default=120.0, help="limit of one training")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
+    parser.add_argument("--output", type=Path, help="folder of the JSON; also no page is written")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    cuda = DEVICE.type == "cuda"
+    device = torch.cuda.get_device_name() if cuda else f"{os.cpu_count()} CPU cores"
+    name = f"speed-{device.lower().replace(' ', '-')}.json" if cuda else "speed.json"
+    output = (arguments.output or RESULTS) / name
+    machine = {
+        "device": device,
+        "processor": platform.machine(),
+        "torch": torch.__version__,
+        "threads": arguments.threads,
+        "clock": "time by the clock" if cuda else "CPU time of the process",
+    }
+    make: dict[str, Callable[[], dict[str, Any]]] = {
+        "costs": lambda: costs(arguments.rounds),
+        "peak": lambda: share_of_peak(arguments.rounds),
+        "growth": lambda: growth(arguments.rounds),
+        "memory": memory,
+        "times": lambda: times(arguments.mesh, arguments.seconds),
+    }
+    for part in arguments.parts:  # kept one by one: a long run that is stopped has its parts
+        found = make[part]()
+        results = json.loads(output.read_text()) if output.exists() else {}
+        results = {**results, "machine": machine, part: found}
+        output.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(output, (json.dumps(results, indent=1) + "\n").encode())
+        if arguments.output is None and not cuda:
+            PAGE.write_text(page(results))
+    print(page(results))
+
+
+if __name__ == "__main__":
+    main()
