@@ -86,6 +86,7 @@ class TrainerSchema:
     threads: int | None = MISSING
     gradient_clip: float | None = MISSING
     progress: bool = MISSING
+    precision: str = "float32"
 
 
 @dataclass
@@ -141,6 +142,9 @@ _POSITIVE = (
 
 _LARGEST_CONFIG = 1_000_000  # bytes
 _LONGEST_NAME = 100  # of a run folder, without its time; file systems take 255 bytes
+
+# of matrix products in a training, in torch's words
+PRECISIONS = {"float32": "highest", "tf32": "high", "bf16": "medium"}
 
 
 def conf_folder() -> Path:
@@ -221,6 +225,9 @@ def checked(config: DictConfig) -> DictConfig:
     for key in _POSITIVE:
         if OmegaConf.select(typed, key) < 1:
             raise NsmError(f"setting {key}: {OmegaConf.select(typed, key)} is not at least 1")
+    if typed.trainer.precision not in PRECISIONS:
+        words = ", ".join(PRECISIONS)
+        raise NsmError(f"setting trainer.precision: {typed.trainer.precision} is not of {words}")
     if not 0 <= typed.data.vertex_share <= 1:
         raise NsmError(f"setting data.vertex_share: {typed.data.vertex_share} is not in [0, 1]")
     from nsm.choices import check_choices  # torch takes seconds; mistakes above need not wait

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import Callback, LearningRateMonitor
 from rich.console import Console
 
+from nsm.config import PRECISIONS
 from nsm.data import OverfitData
 from nsm.errors import NsmError
 from nsm.results import atomic_write
@@ -171,12 +172,16 @@ def fitted(
     logged = plain(config)["logger"]
     kinds, places = logged["kinds"], {key: logged[key] for key in ("project", "uri", "every")}
     trainer.loggers = build_loggers(kinds, folder, plain(config), first_step=first_step, **places)
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(PRECISIONS[settings.precision])
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of an interrupt
         if not trainer.interrupted:
             raise
     finally:
+        # results are measured in full precision
+        torch.set_float32_matmul_precision(before)
         if trainer.state.status != "finished":
             close(trainer.loggers, "failed")
     if trainer.interrupted:
