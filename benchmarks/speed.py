@@ -46,6 +46,7 @@ SETTINGS = ("paper", "default")
 ERRORS = (1.0, 0.5, 0.2, 0.1)  # RMS in percent of the diagonal
 SHARES = (0.5, 0.8, 0.9, 0.95)  # of the way from the domain's distortion to the least one found
 SURFACES = 3
+NEVER = 10**12  # steps
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 Step = Callable[[], None]
@@ -140,7 +141,7 @@ def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]
                 [p.map for p in phis], list(module.map), batch.uv, module.rim
             )
 
-    module.note = lambda figures: None  # there is no logger here
+    module.log_every = NEVER  # there is no logger here
     given = batch.uv if task == "collection_map" else batch
 
     def step(loss: Callable[[], Tensor]) -> Step:
@@ -271,7 +272,7 @@ def _held_out(data: OverfitData) -> Samples:
 
 def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limit: float) -> float:
     """Train until the last step, the limit or a look says so; returns the seconds, looks aside."""
-    module.note = lambda figures: None
+    module.log_every = NEVER
     parts = module.configure_optimizers()
     optimiser, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
     clip, spent, seen, step = config.trainer.gradient_clip, 0.0, 0.0, 0
