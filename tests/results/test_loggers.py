@@ -144,8 +144,9 @@ def test_wandb_keeps_a_run_offline(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "logger.json").read_text())["wandb"]
 
 
-def test_mlflow_stores_curves_and_figures(tmp_path):
+def test_mlflow_stores_curves_and_figures(tmp_path, monkeypatch):
     mlflow = pytest.importorskip("mlflow", reason="mlflow is not installed")
+    monkeypatch.chdir(tmp_path)  # where it puts pictures, whatever the store is
     store = f"sqlite:///{tmp_path}/mlflow.db"
     phi = overfitted(tmp_path / "run", "logger=mlflow", f"logger.uri={store}", "artefacts=false")
     run_id = json.loads((tmp_path / "run" / "logger.json").read_text())["mlflow"]
