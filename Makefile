@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench bench-maps bench-activation bench-speed torture fuzz clean
+.PHONY: demo test check docs bench bench-maps bench-activation bench-speed torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -11,9 +11,14 @@ test: check
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 check: .venv/.nsm-dev
-	$(BIN)/ruff check nsm hydra_plugins tests benchmarks
-	$(BIN)/ruff format --check nsm hydra_plugins tests benchmarks
+	$(BIN)/ruff check nsm hydra_plugins tests benchmarks docs
+	$(BIN)/ruff format --check nsm hydra_plugins tests benchmarks docs
 	$(BIN)/mypy
+
+# The pages of docs/, the reference of settings made of conf/, the API: site/index.html.
+docs: .venv/.nsm-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "the documentation is in site/index.html"
 
 # Error against time, default beside paper settings: about an hour. MESHES names the folder.
 bench: .venv/.nsm-dev
@@ -51,8 +56,12 @@ bench-speed: .venv/.nsm-dev
 	touch $@
 
 .venv/.nsm-dev: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,brain,joblib,optuna]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,brain,docs,joblib,optuna]'
+	touch $@ .venv/.nsm
+
+.venv/.nsm-docs: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	touch $@ .venv/.nsm
 
 clean:
-	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv build dist site .pytest_cache .mypy_cache .ruff_cache

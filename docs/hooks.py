@@ -1,0 +1,112 @@
+"""What mkdocs does not do by itself: pages made of README.md and conf/, and the navigation."""
+
+from __future__ import annotations
+
+import html
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+from nsm.reference import Group, Setting, groups, ungrouped  # noqa: E402
+
+FIRST = ("tutorial.md", "extending.md")
+REFERENCE = ("settings.md", "api.md")
+
+
+def on_config(config: Any) -> Any:
+    """The navigation: every page of docs/ is in it, whoever adds one."""
+    pages = sorted(file.name for file in Path(config.docs_dir).glob("*.md"))
+    guides = [page for page in pages if page not in (*FIRST, *REFERENCE)]
+    first = [page for page in FIRST if page in pages]
+    config.nav = [
+        {"nsm": "index.md"},
+        *first,
+        {"Guides": guides},
+        {"Reference": [{"Settings": "settings.md"}, {"API": "api.md"}]},
+    ]
+    return config
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """The front page, the settings, and the results of the benchmarks that pages link to."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    files.append(File.generated(config, "index.md", content=front_page(readme)))
+    files.append(File.generated(config, "settings.md", content=settings_page()))
+    for name in ("LICENSE", "SECURITY.md"):
+        if f"]({name}" in readme:
+            text = (ROOT / name).read_text(encoding="utf-8")
+            files.append(File.generated(config, name, content=text))
+    for result in sorted((ROOT / "benchmarks" / "results").rglob("*")):
+        if result.is_file():
+            name = result.relative_to(ROOT).as_posix()
+            files.append(File.generated(config, name, abs_src_path=str(result)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Links to the repository's files outside docs/ become links to their copies in the site."""
+    return re.sub(r"\]\(\.\./(benchmarks|README\.md|SECURITY\.md)", _inside, markdown)
+
+
+def _inside(link: re.Match[str]) -> str:
+    return "](" + link.group(1).replace("README.md", "index.md")
+
+
+def front_page(readme: str) -> str:
+    """README.md as a page of docs/; a folder of results is no page, and is named only."""
+    text = readme.replace("](docs/", "](")
+    return re.sub(r"\[([^\]]*)\]\((benchmarks/[^)]*[^.)/]*/?)\)", _result, text)
+
+
+def _result(link: re.Match[str]) -> str:
+    return link.group(0) if (ROOT / link.group(2)).is_file() else link.group(1)
+
+
+def settings_page() -> str:
+    """The reference of all groups, options and settings, as `nsm --help` has them."""
+    parts = [
+        "# Settings",
+        "Made of the files of `conf/`, as `nsm --help` is. `GROUP=OPTION` chooses an option of a "
+        "group, `SETTING=VALUE` replaces a setting, `+SETTING=VALUE` adds one that the chosen "
+        "option leaves out.",
+        *map(_group, groups()),
+        "## Outside the groups",
+        _table(ungrouped()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _group(group: Group) -> str:
+    default = f"By default `{group.name}={group.default}`." if group.default != "null" else ""
+    parts = [f"## {group.name}", f"{_text(group.remark[:1].upper() + group.remark[1:])}."]
+    parts += [default] if default else []
+    for option in group.options:
+        parts += [f"### {group.name}={option.name}", _text(option.remark)]
+        parts += [_table(option.settings)] if option.settings else []
+    return "\n\n".join(part for part in parts if part)
+
+
+def _table(settings: tuple[Setting, ...]) -> str:
+    rows = [f"| `{s.key}` | {_code(s.value)} | {_text(s.remark)} |" for s in settings]
+    return "\n".join(["| setting | value | |", "|---|---|---|", *rows])
+
+
+def _code(value: str) -> str:
+    return f"<code>{_plain(value)}</code>"
+
+
+def _text(remark: str) -> str:
+    """Nothing in a remark is markup but what stands between backticks."""
+    parts = remark.split("`")
+    return "".join(_code(part) if k % 2 else _plain(part) for k, part in enumerate(parts))
+
+
+def _plain(words: str) -> str:
+    escaped = html.escape(words, quote=False)
+    return re.sub(r"[|*_\[\]{}]", lambda sign: f"&#{ord(sign.group())};", escaped)
