@@ -14,6 +14,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nsm.api import load, map_collection, map_pair, overfit, parameterize
     from nsm.errors import NsmError
+    from nsm.extensions import (
+        register_activation,
+        register_analytic,
+        register_block,
+        register_encoding,
+        register_energy,
+    )
     from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
     from nsm.surfaces import Surface, catalogue_names
 
@@ -30,6 +37,11 @@ __all__ = [
     "map_pair",
     "overfit",
     "parameterize",
+    "register_activation",
+    "register_analytic",
+    "register_block",
+    "register_encoding",
+    "register_energy",
 ]
 
 _HOME = {
@@ -45,6 +57,11 @@ _HOME = {
     "Parameterization": "nsm.results",
     "overfit": "nsm.api",
     "parameterize": "nsm.api",
+    "register_activation": "nsm.extensions",
+    "register_analytic": "nsm.extensions",
+    "register_block": "nsm.extensions",
+    "register_encoding": "nsm.extensions",
+    "register_energy": "nsm.extensions",
 }
 
 

@@ -68,7 +68,7 @@ def check_choices(config: DictConfig) -> None:
     for kind in settings["logger"]["kinds"]:
         _one_of("logger.kinds", kind, LOGGERS)
         require(kind)
-    for group, known in NAMED.items():
+    for group, known in named().items():
         _check_named(group, settings[group], known)
     choice = TASK_CHOICES[task]
     if choice.constraints:
@@ -127,21 +127,24 @@ TASK_CHOICES: dict[str, TaskChoice] = {
     "collection_map": TaskChoice(_WEIGHTS, _CONSTRAINTS, Constraints),
 }
 
-# group -> name -> what it takes
-NAMED: dict[str, dict[str, Parameters]] = {
-    "activation": {
-        name: {key: Parameter(float) for key in formulas.defaults}
-        for name, formulas in ACTIVATIONS.items()
-    },
-    "encoding": {name: parameters(cls, skip=1) for name, cls in ENCODINGS.items()},
-    "optimizer": {
-        name: {**parameters(cls, skip=1), **_ALL_OPTIMIZERS} for name, cls in OPTIMIZERS.items()
-    },
-    "scheduler": {
-        name: {**parameters(function, skip=1), **_ALL_SCHEDULERS}
-        for name, function in SCHEDULERS.items()
-    },
-}
+
+def named() -> dict[str, dict[str, Parameters]]:
+    """Group to name to what it takes, with what has been registered."""
+    return {
+        "activation": {
+            name: {key: Parameter(float) for key in formulas.defaults}
+            for name, formulas in ACTIVATIONS.items()
+        },
+        "encoding": {name: parameters(cls, skip=1) for name, cls in ENCODINGS.items()},
+        "optimizer": {
+            name: {**parameters(cls, skip=1), **_ALL_OPTIMIZERS} for name, cls in OPTIMIZERS.items()
+        },
+        "scheduler": {
+            name: {**parameters(function, skip=1), **_ALL_SCHEDULERS}
+            for name, function in SCHEDULERS.items()
+        },
+    }
+
 
 _WORDS: dict[str, Iterable[str]] = {
     "domain": DOMAINS,

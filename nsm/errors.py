@@ -6,3 +6,13 @@ class NsmError(Exception):
 
     The command line prints the message without a traceback and exits with status 2.
     """
+
+
+class NotRegistered(NsmError):
+    """A file names something that is neither nsm's nor registered in this process."""
+
+    def __init__(self, kind: str, name: object, register: str) -> None:
+        super().__init__(
+            f"it was made with the {kind} {str(name)[:60]!r}, which is not known here; if it is "
+            f"one of your own, call nsm.{register} first"
+        )

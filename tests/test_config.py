@@ -5,7 +5,7 @@ import inspect
 import pytest
 import torch
 
-from nsm.choices import NAMED, TASK_CHOICES
+from nsm.choices import TASK_CHOICES, named
 from nsm.config import compose_config, conf_folder, known_keys
 from nsm.errors import NsmError
 from nsm.pipeline import TASKS
@@ -34,20 +34,20 @@ def test_every_file_composes(group, name, monkeypatch):
     words = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
     config = compose_config(words)
     assert config.domain == ("square" if name == "square" else "disc")
-    if group in NAMED:
-        assert config[group].name in NAMED[group]
+    if group in named():
+        assert config[group].name in named()[group]
 
 
 def test_every_known_choice_is_an_option():
     """Nothing that the code offers is out of reach of GROUP=OPTION."""
-    for group, known in NAMED.items():
+    for group, known in named().items():
         options = [name for g, name in FILES if g == group]
         assert {compose_config([f"{group}={o}"])[group].name for o in options} == set(known)
     assert set(TASK_CHOICES) == set(TASKS) == {name for g, name in FILES if g == "task"}
 
 
 def test_optimizers_take_what_torch_takes():
-    assert set(NAMED["optimizer"]["sgd"]) == {
+    assert set(named()["optimizer"]["sgd"]) == {
         *inspect.signature(torch.optim.SGD).parameters,
         "encoding_lr",
     } - {"params"}

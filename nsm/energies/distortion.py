@@ -40,7 +40,7 @@ _VANISHING = 1e-60  # squared trace under which M is the zero matrix
 P = ParamSpec("P")
 
 
-def _of_metrics(
+def of_invariants(
     formula: Callable[Concatenate[Invariants, P], Tensor],
 ) -> Callable[Concatenate[Tensor, Tensor, P], Tensor]:
     """Turn a formula in the invariants of M into an energy of the two metrics."""
@@ -70,7 +70,7 @@ def _area(m: Invariants) -> Tensor:
     return (determinant - 1) ** 2 + (1 / determinant - 1) ** 2
 
 
-@_of_metrics
+@of_invariants
 def symmetric_dirichlet(m: Invariants, epsilon: float = 0.01) -> Tensor:
     """tr(M) + tr((M + εI)⁻¹) = t + (t + 2ε)/(d + εt + ε²): METHOD, Eq. 2.
 
@@ -86,7 +86,7 @@ def symmetric_dirichlet(m: Invariants, epsilon: float = 0.01) -> Tensor:
     return m.trace + shifted.trace / shifted.determinant
 
 
-@_of_metrics
+@of_invariants
 def conformal(m: Invariants) -> Tensor:
     """‖tr(M)/‖M‖² · M − I‖² = (t² − 4d)/(t² − 2d), METHOD Eq. 3: in [0, 1], zero if conformal.
 
@@ -97,7 +97,7 @@ def conformal(m: Invariants) -> Tensor:
     return (1 - 4 * share) / (1 - 2 * share)
 
 
-@_of_metrics
+@of_invariants
 def singular_value_ratio(m: Invariants) -> Tensor:
     """σ₁/σ₂, at least 1: what the paper reports as conformal distortion.
 
@@ -107,27 +107,27 @@ def singular_value_ratio(m: Invariants) -> Tensor:
     return (aspect_squared.clamp(min=4).sqrt() + safe_sqrt(aspect_squared - 4, 1e-14)) / 2
 
 
-@_of_metrics
+@of_invariants
 def arap(m: Invariants) -> Tensor:
     """Σ(σᵢ − 1)², the squared distance of J_f to the nearest rotation or reflection."""
     shifted = m.shifted(COLLAPSE)
     return _arap(shifted.trace, shifted.determinant.sqrt())
 
 
-@_of_metrics
+@of_invariants
 def symmetric_arap(m: Invariants) -> Tensor:
     """Σ(σᵢ − 1)² + Σ(1/σᵢ − 1)²: ARAP of the map and of its inverse."""
     t, d = m.shifted(COLLAPSE)
     return _arap(t, d.sqrt()) + _arap(t / d, 1 / d.sqrt())
 
 
-@_of_metrics
+@of_invariants
 def mips(m: Invariants) -> Tensor:
     """σ₁/σ₂ + σ₂/σ₁ = t/√d (Hormann and Greiner, 2000); 2 where conformal."""
     return _aspect_squared(m).sqrt()
 
 
-@_of_metrics
+@of_invariants
 def area(m: Invariants) -> Tensor:
     """(det − 1)² + (1/det − 1)², authalic: zero where areas are kept.
 
@@ -137,13 +137,13 @@ def area(m: Invariants) -> Tensor:
     return _area(m)
 
 
-@_of_metrics
+@of_invariants
 def dirichlet(m: Invariants) -> Tensor:
     """t/2 = (σ₁² + σ₂²)/2: harmonic maps are its critical points."""
     return m.trace / 2
 
 
-@_of_metrics
+@of_invariants
 def equiareal_conformal(m: Invariants, blend: float = 0.5) -> Tensor:
     """(1 − λ)·(MIPS/2 − 1) + λ·area, λ = ``blend``: angles at 0, areas at 1; zero at isometry.
 

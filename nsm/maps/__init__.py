@@ -1,9 +1,9 @@
 """Maps turn points into points; each answers ``map(x)`` and ``map.value_and_jacobian(x)``."""
 
 from nsm.maps.activations import ACTIVATIONS, Activation
-from nsm.maps.analytic import ANALYTIC, AnalyticSurface, build_analytic
+from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Formula, build_analytic
 from nsm.maps.composition import Composition, PointMap, Rotated
-from nsm.maps.encodings import ENCODINGS, RandomFourierFeatures, SplineGrid
+from nsm.maps.encodings import ENCODINGS, Encoding, RandomFourierFeatures, SplineGrid
 from nsm.maps.inverse import Between, inverted
 from nsm.maps.networks import BLOCKS, NeuralMap, build_map
 from nsm.maps.planar import DiscMap, Planar, PlanarMap, SquareMap, build_planar
@@ -18,6 +18,8 @@ __all__ = [
     "AnalyticSurface",
     "Composition",
     "DiscMap",
+    "Encoding",
+    "Formula",
     "NeuralMap",
     "Planar",
     "PlanarMap",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -103,6 +104,23 @@ class Formulas:
     from_value: Callable[..., tuple[Tensor, Tensor | None]] | None = None
     curvature: Callable[..., Tensor] | None = None
     defaults: dict[str, float] = field(default_factory=dict)
+
+
+def elementwise(function: Callable[..., Tensor], defaults: dict[str, float]) -> Formulas:
+    """The formulas of a function z ↦ f(z), differentiated by PyTorch's forward mode."""
+
+    def value_and_slope(z: Tensor, **parameters: float) -> ValueAndSlope:
+        both = torch.func.jvp(partial(function, **parameters), (z,), (torch.ones_like(z),))
+        return both[0], both[1]
+
+    def curvature(z: Tensor, **parameters: float) -> Tensor:
+        def slope(y: Tensor) -> Tensor:
+            return value_and_slope(y, **parameters)[1]
+
+        bend: Tensor = torch.func.jvp(slope, (z,), (torch.ones_like(z),))[1]
+        return bend
+
+    return Formulas(value_and_slope, curvature=curvature, defaults=defaults)
 
 
 ACTIVATIONS: dict[str, Formulas] = {

@@ -13,6 +13,7 @@ import math
 import operator
 from collections.abc import Callable
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 import torch
@@ -464,7 +465,45 @@ class Graph(AnalyticSurface):
         return (u, v, z), (one, zero, z_u), (zero, one, z_v)
 
 
-ANALYTIC: dict[str, type[AnalyticSurface]] = {
+class Formula(AnalyticSurface):
+    """(x, y, z) by a function of u and v, differentiated by PyTorch's forward mode.
+
+    Args:
+        name: what the surface is called.
+        function: u (N,), v (N,) and parameters to three coordinates (N,), each point's of its own
+            u and v alone; finite and smooth on the closed disc.
+        **parameters: of the function.
+
+    Raises:
+        NsmError: the function takes no such parameters, or gives no surface.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Triple],
+        area: float | None = math.pi,
+        **parameters: Any,
+    ) -> None:
+        try:
+            inspect.signature(function).bind(None, None, **parameters)
+        except TypeError as error:
+            raise NsmError(f"{name}: {error}") from None
+        self.name, self._point = name, partial(function, **parameters)
+        super().__init__(area, **parameters)
+
+    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
+        one, zero = torch.ones_like(u), torch.zeros_like(u)
+        along_u = torch.func.jvp(self._on_all, (u, v), (one, zero))
+        along_v = torch.func.jvp(self._on_all, (u, v), (zero, one))
+        return along_u[0], along_u[1], along_v[1]
+
+    def _on_all(self, u: Tensor, v: Tensor) -> Triple:
+        x, y, z = (torch.as_tensor(c, dtype=u.dtype) + 0 * u for c in self._point(u, v))
+        return x, y, z
+
+
+ANALYTIC: dict[str, Callable[..., AnalyticSurface]] = {
     kind.name: kind
     for kind in (
         Plane,

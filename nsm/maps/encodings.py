@@ -3,12 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+
+class Encoding(Protocol):
+    """What stands before a network: a module from points x (N, 2) to features (N, out_dim).
+
+    One that has no ``value_and_jacobian_stack`` is differentiated by :func:`pushed_forward`.
+    """
+
+    out_dim: int
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Points (N, 2) to (N, out_dim), each row of its own point alone."""
+        ...
+
+
+def pushed_forward(function: Callable[[Tensor], Tensor], stack: Tensor) -> Tensor:
+    """A function of the rows of a tensor, with its tangents, by PyTorch's forward mode.
+
+    Args:
+        function: (N, d) to (N, d'), each row of its own row alone.
+        stack: value and both tangents of its argument, (3, N, d).
+
+    Returns:
+        Value and both tangents of the function, (3, N, d'), differentiable as the function is.
+    """
+    by_u, by_v = (torch.func.jvp(function, (stack[0],), (tangent,)) for tangent in stack[1:])
+    return torch.stack([by_u[0], by_u[1], by_v[1]])
+
+
+def value_and_jacobian_stack(encoding: Encoding, x: Tensor) -> Tensor:
+    """Value and both tangents of an encoding at points (N, 2), stacked: (3, N, out_dim)."""
+    if hasattr(encoding, "value_and_jacobian_stack"):
+        stack: Tensor = encoding.value_and_jacobian_stack(x)
+        return stack
+    return pushed_forward(encoding, Identity(x.shape[1]).value_and_jacobian_stack(x))
 
 
 class Identity(nn.Module):
@@ -230,9 +265,7 @@ class SplineGrid(nn.Module):
         return torch.cat(parts, dim=-1)
 
 
-Encoding = Identity | RandomFourierFeatures | SplineGrid
-
-ENCODINGS: dict[str, type[Encoding]] = {
+ENCODINGS: dict[str, Callable[..., Encoding]] = {
     "identity": Identity,
     "fourier": RandomFourierFeatures,
     "spline_grid": SplineGrid,

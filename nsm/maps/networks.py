@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from nsm.maps.activations import Activation
-from nsm.maps.encodings import ENCODINGS, Encoding
+from nsm.maps.encodings import (
+    ENCODINGS,
+    Encoding,
+    pushed_forward,
+    value_and_jacobian_stack,
+)
 from nsm.maps.trunk import Trunk
 
 
@@ -48,13 +54,14 @@ class DenseBlock(nn.Module):
         return self.activation(self.linear(x))
 
 
-Block = DenseBlock | PostActivationBlock | PreActivationBlock
-BLOCKS: dict[str, type[Block]] = {
+# from the features and the activation to a module (N, width) to (N, width)
+BLOCKS: dict[str, Callable[[int, Activation], nn.Module]] = {
     "plain": DenseBlock,
     "post": PostActivationBlock,
     "pre": PreActivationBlock,
 }
-# what every second layer adds (see :class:`nsm.maps.trunk.Trunk`)
+# what every second layer adds (see :class:`nsm.maps.trunk.Trunk`); others than these blocks have
+# no written-out backward pass
 SKIPS = {"plain": None, "post": "post", "pre": "pre"}
 INITIALISATIONS = ("xavier", "kaiming", "siren")
 
@@ -65,7 +72,8 @@ class NeuralMap(nn.Module):
     Args:
         out_dim: 3 for a surface φ, 2 for a planar map h.
         width, depth: features of the hidden layers; number of blocks.
-        block: ``plain`` (one layer each), ``post`` (published residual) or ``pre``.
+        block: ``plain`` (one layer each), ``post`` (published residual), ``pre``, or one that was
+            registered.
         activation: ``{"name": ..., parameters}``; see :mod:`nsm.maps.activations`.
         encoding: ``{"name": ..., parameters}``; see :mod:`nsm.maps.encodings`.
         initialisation: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
@@ -107,14 +115,13 @@ class NeuralMap(nn.Module):
         self.input = nn.Linear(self.encoding.out_dim, width)
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
         self.output = nn.Linear(width, out_dim)
-        self._layers = [m for m in self.modules() if isinstance(m, nn.Linear)]
+        modules = (self.input, *self.blocks.modules(), self.output)
+        self._layers = [m for m in modules if isinstance(m, nn.Linear)]
         self._initialise(initialisation)
 
     def _initialise(self, how: str) -> None:
         omega = float(self.activation.parameters_.get("omega", 1.0))
-        for module in self.modules():
-            if not isinstance(module, nn.Linear):
-                continue
+        for module in self._layers:
             if how == "xavier":
                 nn.init.xavier_normal_(module.weight)
                 nn.init.zeros_(module.bias)
@@ -135,7 +142,11 @@ class NeuralMap(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) points of Ω to (N, out_dim)."""
-        y = self.input(self.encoding(x))
+        return self._after(self.encoding(x))
+
+    def _after(self, features: Tensor) -> Tensor:
+        """What comes after the encoding."""
+        y = self.input(features)
         if self._opens_with_activation:
             y = self.activation(y)
         for block in self.blocks:
@@ -146,13 +157,17 @@ class NeuralMap(nn.Module):
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
-        s = Trunk.apply(
-            self.encoding.value_and_jacobian_stack(x),
-            self.activation,
-            SKIPS[self.config["block"]],
-            torch.is_grad_enabled(),
-            *(p for layer in self._layers for p in (layer.weight, layer.bias)),
-        )
+        s = value_and_jacobian_stack(self.encoding, x)
+        if self.config["block"] in SKIPS:
+            s = Trunk.apply(
+                s,
+                self.activation,
+                SKIPS[self.config["block"]],
+                torch.is_grad_enabled(),
+                *(p for layer in self._layers for p in (layer.weight, layer.bias)),
+            )
+        else:
+            s = pushed_forward(self._after, s)
         return s[0], s[1:].permute(1, 2, 0)
 
 

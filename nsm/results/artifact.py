@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nsm.maps import build_analytic, build_map
+from nsm.errors import NotRegistered
+from nsm.maps import ANALYTIC, build_analytic, build_map
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
@@ -137,6 +138,8 @@ def load_surface(folder: str | Path) -> NeuralSurface:
 def _network(config: dict[str, Any], state: dict[str, Tensor]) -> nn.Module:
     """A network, or the closed form of an analytic surface, from its configuration and weights."""
     if "name" in config:
+        if config["name"] not in ANALYTIC:
+            raise NotRegistered("analytic surface", config["name"], "register_analytic")
         return build_analytic(config)
     if config.get("out_dim") != 3:
         raise ValueError("the network is no map to space")

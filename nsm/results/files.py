@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from nsm.errors import NsmError
+from nsm.errors import NotRegistered, NsmError
 
 # What the words and arrays of a damaged or forged artefact may raise while it is put together.
 BROKEN = (
@@ -164,6 +164,8 @@ def check_stored(archive: Path) -> None:
 
 def misfit(stem: Path, error: Exception) -> NsmError:
     """The message for an artefact whose parts do not fit together."""
+    if isinstance(error, NotRegistered):
+        return NsmError(f"{stem}: {error}")
     reason = " ".join(str(error).split())[:120]
     return NsmError(f"{stem}: its two files do not fit together ({reason}); make the run again")
 

@@ -8,6 +8,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from nsm.errors import NotRegistered
+from nsm.maps import ACTIVATIONS, BLOCKS, ENCODINGS
+
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -22,8 +25,10 @@ def network_of(
     and compared with them.
 
     Raises:
+        NotRegistered: a name that is not known.
         ValueError, RuntimeError, TypeError, KeyError: settings and weights do not fit together.
     """
+    _check_known(config)
     encoding = config.get("encoding") or {}
     for count in (config.get("depth", 0), len(encoding.get("resolutions", ()))):
         if count > len(tensors):
@@ -38,3 +43,14 @@ def network_of(
     network = build(config)
     network.load_state_dict(dict(tensors))
     return network
+
+
+def _check_known(config: dict[str, Any]) -> None:
+    names: dict[str, tuple[Any, Mapping[str, Any]]] = {
+        "activation": ((config.get("activation") or {}).get("name"), ACTIVATIONS),
+        "encoding": ((config.get("encoding") or {}).get("name"), ENCODINGS),
+        "block": (config.get("block"), BLOCKS),
+    }
+    for kind, (name, known) in names.items():
+        if isinstance(name, str) and name not in known:
+            raise NotRegistered(kind, name, f"register_{kind}")
