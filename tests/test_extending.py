@@ -8,22 +8,27 @@ import torch
 
 import nsm
 from nsm.config import compose_config
-from nsm.energies import energy
-from nsm.maps import build_analytic, build_map
+from nsm.energies import ENERGIES, energy
+from nsm.maps import ACTIVATIONS, ANALYTIC, BLOCKS, ENCODINGS, build_analytic, build_map
 
 PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
-BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.S | re.M)
+EXAMPLES = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.S | re.M)
 
 
 @pytest.fixture(scope="module")
 def page():
     """The names that the page's examples leave, run in turn as a reader would."""
+    tables = (ENERGIES, ACTIVATIONS, ENCODINGS, BLOCKS, ANALYTIC)
+    before = [dict(table) for table in tables]
     names: dict = {"__name__": "page"}
-    for block in BLOCKS:
+    for block in EXAMPLES:
         assert len([line for line in block.splitlines() if line.strip()]) < 15
         if "nsm.cli" not in block:
             exec(block, names)
-    return names
+    yield names
+    for table, old in zip(tables, before, strict=True):
+        table.clear()
+        table.update(old)
 
 
 def metrics(count):
