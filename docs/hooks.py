@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import html
 import re
 import sys
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +50,17 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Links to the repository's files outside docs/ become links to their copies in the site."""
-    return re.sub(r"\]\(\.\./(benchmarks|README\.md|SECURITY\.md)", _inside, markdown)
+    """Links to the repository's files outside docs/ become links to their copies in the site.
+
+    A folder of results is no page, and is named only.
+    """
+    inside = re.sub(r"\]\(\.\./(benchmarks|README\.md|SECURITY\.md)", _inside, markdown)
+    return re.sub(r"\[([^\]]*)\]\((benchmarks/[^)#]*)\)", _result, inside)
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Docstrings name code by roles, which Markdown does not know."""
+    return re.sub(r":(func|class|mod|meth):(?=<code>|<span)", "", html)
 
 
 def _inside(link: re.Match[str]) -> str:
@@ -59,9 +68,8 @@ def _inside(link: re.Match[str]) -> str:
 
 
 def front_page(readme: str) -> str:
-    """README.md as a page of docs/; a folder of results is no page, and is named only."""
-    text = readme.replace("](docs/", "](")
-    return re.sub(r"\[([^\]]*)\]\((benchmarks/[^)]*[^.)/]*/?)\)", _result, text)
+    """README.md as a page of docs/."""
+    return readme.replace("](docs/", "](")
 
 
 def _result(link: re.Match[str]) -> str:
@@ -108,5 +116,5 @@ def _text(remark: str) -> str:
 
 
 def _plain(words: str) -> str:
-    escaped = html.escape(words, quote=False)
-    return re.sub(r"[|*_\[\]{}]", lambda sign: f"&#{ord(sign.group())};", escaped)
+    plain = escape(words, quote=False)
+    return re.sub(r"[|*_\[\]{}]", lambda sign: f"&#{ord(sign.group())};", plain)

@@ -1,9 +1,10 @@
 """Neural surface maps: surfaces as networks, and maps between them.
 
->>> import nsm
->>> surface = nsm.Surface.load("terrain")
->>> phi = nsm.overfit(surface)
->>> phi(uv)
+Examples:
+    >>> import nsm
+    >>> surface = nsm.Surface.load("terrain")
+    >>> phi = nsm.overfit(surface)
+    >>> phi(uv)
 """
 
 from __future__ import annotations
