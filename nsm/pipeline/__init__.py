@@ -23,6 +23,7 @@ __all__ = [
     "quiet_lightning",
     "run",
     "run_collection_map",
+    "run_held",
     "run_overfit",
     "run_pair_map",
     "run_param",
@@ -37,21 +38,26 @@ TASKS: dict[str, Callable[..., Any]] = {
 
 
 def run(config: DictConfig, folder: Path) -> None:
-    """Run the task of a configuration in a folder.
+    """Run the task of a configuration in a folder, where no other run may be at work.
 
     With ``resume`` set, the folder's own configuration takes its place, and the training goes on
     from its checkpoint.
 
     Raises:
-        NsmError: bad input of any kind.
+        NsmError: bad input of any kind, or another process at work in the folder.
     """
+    with alone(folder):
+        run_held(config, folder)
+
+
+def run_held(config: DictConfig, folder: Path) -> None:
+    """What :func:`run` does, in a folder that its caller holds."""
     resuming = config.resume is not None
     if resuming:
         config = _stored_config(folder)
     if config.task.name not in TASKS:
         raise NsmError(f"task.name={config.task.name} is not one of {', '.join(TASKS)}")
-    with alone(folder):
-        TASKS[config.task.name](config, folder, resuming=resuming)
+    TASKS[config.task.name](config, folder, resuming=resuming)
 
 
 def _stored_config(folder: Path) -> DictConfig:

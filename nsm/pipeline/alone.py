@@ -15,12 +15,13 @@ LOCK_FILE = ".lock"
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Hold a run folder, which is made if need be; the operating system lets go of it when the
-    process ends, however that happens.
+    """Hold a run folder, which is made if need be, and taken away if nothing came of it; the
+    operating system lets go of it when the process ends, however that happens.
 
     Raises:
         NsmError: another process holds it.
     """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK_FILE, timeout=0)
     try:
@@ -32,8 +33,10 @@ def alone(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        lock.release(force=True)
         if [entry.name for entry in folder.iterdir()] == [LOCK_FILE]:
-            lock.release(force=True)  # nothing came of it: leave an empty folder, as found
             (folder / LOCK_FILE).unlink(missing_ok=True)
-        else:
-            lock.release(force=True)
+            for place in made:
+                if any(place.iterdir()):
+                    break
+                place.rmdir()

@@ -9,16 +9,16 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 
 from nsm.config import checked, register_resolvers
 from nsm.errors import NsmError
-from nsm.pipeline import run
+from nsm.pipeline import run_held
+from nsm.pipeline.alone import alone
 from nsm.pipeline.common import CONFIG_FILE
 from nsm.sweeps import is_complete
 
-ERROR_FILE, LOG_FILE, LOCK_FILE = "error.txt", "log.txt", ".lock"
+ERROR_FILE, LOG_FILE = "error.txt", "log.txt"
 
 
 def run_job(settings: dict[str, Any], folder: str, cwd: str, *, log: bool) -> str | None:
@@ -38,16 +38,12 @@ def run_job(settings: dict[str, Any], folder: str, cwd: str, *, log: bool) -> st
     os.chdir(cwd)
     register_resolvers()
     place = Path(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    (place / ERROR_FILE).unlink(missing_ok=True)
-    lock = FileLock(place / LOCK_FILE, timeout=0)
     try:
-        with lock, _output(place / LOG_FILE if log else None):
-            message = _attempt(settings, place)
-            (place / LOCK_FILE).unlink(missing_ok=True)
-    except Timeout:
-        return "another process is at work on it"
-    return message
+        with alone(place), _output(place / LOG_FILE if log else None):
+            (place / ERROR_FILE).unlink(missing_ok=True)
+            return _attempt(settings, place)
+    except NsmError as error:  # another process is at work on it
+        return str(error)
 
 
 def _attempt(settings: dict[str, Any], place: Path) -> str | None:
@@ -56,7 +52,7 @@ def _attempt(settings: dict[str, Any], place: Path) -> str | None:
             config = checked(OmegaConf.create(settings))
             if (place / CONFIG_FILE).is_file():
                 config.resume = str(place)
-            run(config, place)
+            run_held(config, place)
         return None
     except NsmError as error:
         message = text = str(error)
