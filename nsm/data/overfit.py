@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pytorch_lightning as pl
@@ -92,7 +92,50 @@ class OverfitData(pl.LightningDataModule):
         steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
         return DataLoader(steps, batch_size=None)
 
-    def val_dataloader(self) -> DataLoader[Samples]:
+    def held_out_batches(self) -> list[Samples]:
+        """The held-out samples, so many at once as are evaluated together."""
         samples = self.sampler.by_area(self.held_out, self.sampler.generator(HELD_OUT_SEED))
-        chunks = [Samples(*parts) for parts in zip(*(p.split(8192) for p in samples), strict=True)]
-        return DataLoader(chunks, batch_size=None)  # type: ignore[arg-type]
+        return [Samples(*parts) for parts in zip(*(p.split(8192) for p in samples), strict=True)]
+
+    def val_dataloader(self) -> DataLoader[Samples]:
+        return DataLoader(self.held_out_batches(), batch_size=None)  # type: ignore[arg-type]
+
+
+class SeveralData(pl.LightningDataModule):
+    """The samples that :class:`OverfitData` has of each of k surfaces: Samples of (k, N, ...).
+
+    Args:
+        surfaces: the prepared surfaces.
+        **settings: as for :class:`OverfitData`, with the steps between two looks at the held-out
+            points.
+    """
+
+    def __init__(
+        self, surfaces: Sequence[Surface], *, steps_per_epoch: int, **settings: Any
+    ) -> None:
+        super().__init__()
+        self.parts = [OverfitData(surface, **settings) for surface in surfaces]
+        self.steps_per_epoch = steps_per_epoch
+
+    def setup(self, stage: str | None = None) -> None:
+        for part in self.parts:
+            part.trainer = self.trainer
+            part.setup(stage)
+
+    def batch(self, step: int) -> Samples:
+        """The training samples of a step."""
+        return _stacked([part.batch(step) for part in self.parts])
+
+    def train_dataloader(self) -> DataLoader[Samples]:
+        trainer = self.trainer
+        assert trainer is not None
+        steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
+        return DataLoader(steps, batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[Samples]:
+        each = zip(*(part.held_out_batches() for part in self.parts), strict=True)
+        return DataLoader([_stacked(batches) for batches in each], batch_size=None)  # type: ignore[arg-type]
+
+
+def _stacked(samples: Sequence[Samples]) -> Samples:
+    return Samples(*(torch.stack(same) for same in zip(*samples, strict=True)))

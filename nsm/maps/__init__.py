@@ -7,6 +7,7 @@ from nsm.maps.encodings import ENCODINGS, Encoding, RandomFourierFeatures, Splin
 from nsm.maps.inverse import Between, inverted
 from nsm.maps.networks import BLOCKS, NeuralMap, build_map
 from nsm.maps.planar import DiscMap, Planar, PlanarMap, SquareMap, build_planar
+from nsm.maps.together import together
 
 __all__ = [
     "ACTIVATIONS",
@@ -32,4 +33,5 @@ __all__ = [
     "build_map",
     "build_planar",
     "inverted",
+    "together",
 ]

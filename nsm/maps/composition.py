@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, cast
 
 import torch
@@ -63,11 +64,20 @@ class Rotated(nn.Module):
         self.inner = inner
         self.register_buffer("rotation", rotation.detach().clone())
 
+    @classmethod
+    def all_of(cls, turned: Sequence[Rotated], inner: nn.Module) -> Rotated:
+        """k such maps as one: ``inner`` does what theirs do, of points (k, N, 2)."""
+        made = cls.__new__(cls)
+        nn.Module.__init__(made)
+        made.inner = inner
+        made.register_buffer("rotation", torch.stack([one.rotation for one in turned]))
+        return made
+
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, n)."""
-        return self.inner(x @ self.rotation.T)
+        return self.inner(x @ self.rotation.mT)
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, n) and Jacobians J_inner(R x)·R, (N, n, 2)."""
-        value, jacobian = cast(PointMap, self.inner).value_and_jacobian(x @ self.rotation.T)
-        return value, jacobian @ self.rotation
+        value, jacobian = cast(PointMap, self.inner).value_and_jacobian(x @ self.rotation.mT)
+        return value, jacobian @ self.rotation.unsqueeze(-3)

@@ -246,11 +246,32 @@ class SplineGrid(nn.Module):
         """Value and both tangents, stacked: (3, N, out_dim)."""
         with torch.no_grad():
             rows, orders = self._seen(x)
-            value, first, second = (torch.stack(w, dim=2) for w in orders)
+        return self._blended(x, rows, orders, list(self.tables))
+
+    @classmethod
+    def stacks_together(cls, grids: Sequence[SplineGrid], x: Tensor) -> Tensor:
+        """What k grids, alike but for their features, have of k sets of points (k, N, 2) each:
+        values and both tangents, stacked: (k, 3, N, out_dim)."""
+        first, points = grids[0], x.flatten(0, 1)
+        with torch.no_grad():
+            rows, orders = first._seen(points)
+            lengths = [len(table) for table in first.tables]
+            # the features of a level lie one grid below the other
+            offsets = torch.tensor(lengths, device=x.device)[:, None] * torch.arange(
+                len(grids), device=x.device
+            )
+            rows = rows + offsets.repeat_interleave(x.shape[1], dim=1)[:, None]
+        tables = [torch.cat(level) for level in zip(*(g.tables for g in grids), strict=True)]
+        stack = first._blended(points, rows, orders, tables)
+        return stack.view(3, *x.shape[:2], -1).transpose(0, 1)
+
+    @staticmethod
+    def _blended(
+        x: Tensor, rows: Tensor, orders: list[list[Tensor]], tables: list[Tensor]
+    ) -> Tensor:
+        value, first, second = (torch.stack(w, dim=2) for w in orders)
         unit = torch.eye(2, dtype=x.dtype, device=x.device)[:, None, :].expand(-1, x.shape[0], -1)
-        blended = _Blend.apply(
-            x, rows, (value, first, second), torch.is_grad_enabled(), *self.tables
-        )
+        blended = _Blend.apply(x, rows, (value, first, second), torch.is_grad_enabled(), *tables)
         return torch.cat([torch.cat([x[None], unit]), blended], dim=-1)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -116,12 +116,12 @@ class NeuralMap(nn.Module):
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
         self.output = nn.Linear(width, out_dim)
         modules = (self.input, *self.blocks.modules(), self.output)
-        self._layers = [m for m in modules if isinstance(m, nn.Linear)]
+        self.layers = [m for m in modules if isinstance(m, nn.Linear)]
         self._initialise(initialisation)
 
     def _initialise(self, how: str) -> None:
         omega = float(self.activation.parameters_.get("omega", 1.0))
-        for module in self._layers:
+        for module in self.layers:
             if how == "xavier":
                 nn.init.xavier_normal_(module.weight)
                 nn.init.zeros_(module.bias)
@@ -164,7 +164,7 @@ class NeuralMap(nn.Module):
                 self.activation,
                 SKIPS[self.config["block"]],
                 torch.is_grad_enabled(),
-                *(p for layer in self._layers for p in (layer.weight, layer.bias)),
+                *(p for layer in self.layers for p in (layer.weight, layer.bias)),
             )
         else:
             s = pushed_forward(self._after, s)

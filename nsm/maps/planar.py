@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from nsm.maps.networks import NeuralMap
 
 
-class _FromIdentity(nn.Module):
+class FromIdentity(nn.Module):
     """A map made of a network whose output layer is zero at the start."""
 
     out_dim: int
@@ -22,13 +22,21 @@ class _FromIdentity(nn.Module):
         nn.init.zeros_(self.network.output.weight)
         nn.init.zeros_(self.network.output.bias)
 
+    @classmethod
+    def around(cls, network: nn.Module) -> FromIdentity:
+        """The map of a network that is there, which also may be several in one batch."""
+        made = cls.__new__(cls)
+        nn.Module.__init__(made)
+        made.network = network  # type: ignore[assignment]
+        return made
+
     @property
     def config(self) -> dict[str, Any]:
         """What the map is built from (see :func:`build_planar`)."""
         return {**self.network.config, "onto": self.onto}
 
 
-class PlanarMap(_FromIdentity):
+class PlanarMap(FromIdentity):
     """h(x) = x + N(x), with a network N whose output layer is zero at the start.
 
     Args:
@@ -47,7 +55,7 @@ class PlanarMap(_FromIdentity):
         return x + value, torch.eye(2, dtype=x.dtype, device=x.device) + jacobian
 
 
-class DiscMap(_FromIdentity):
+class DiscMap(FromIdentity):
     """h(x) = R(θ(x))·(x + (1 − ‖x‖²)·N(x)): the circle goes to itself, whatever N and θ are.
 
     The boundary constraint (METHOD, B) holds by construction, and the image of ∂Ω slides by θ.
@@ -62,25 +70,26 @@ class DiscMap(_FromIdentity):
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
         out = self.network(x)
-        y = x + (1 - (x * x).sum(dim=1, keepdim=True)) * out[:, :2]
-        return _turned(y, out[:, 2].cos(), out[:, 2].sin())
+        y = x + (1 - (x * x).sum(dim=-1, keepdim=True)) * out[..., :2]
+        return _turned(y, out[..., 2].cos(), out[..., 2].sin())
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, 2) and Jacobians (N, 2, 2)."""
         out, jacobian = self.network.value_and_jacobian(x)
-        room = 1 - (x * x).sum(dim=1, keepdim=True)
-        y = x + room * out[:, :2]
+        room = 1 - (x * x).sum(dim=-1, keepdim=True)
+        y = x + room * out[..., :2]
         eye = torch.eye(2, dtype=x.dtype, device=x.device)
-        inner = eye + room[:, :, None] * jacobian[:, :2] - 2 * out[:, :2, None] * x[:, None, :]
+        inner = eye + room[..., None] * jacobian[..., :2, :]
+        inner = inner - 2 * out[..., :2, None] * x[..., None, :]
         # d(R y) = R (dy + y⊥ dθ)
-        across = torch.stack([-y[:, 1], y[:, 0]], dim=1)
-        inner = inner + across[:, :, None] * jacobian[:, 2:3]
-        c, s = out[:, 2].cos(), out[:, 2].sin()
-        columns = [_turned(inner[:, :, k], c, s) for k in (0, 1)]
-        return _turned(y, c, s), torch.stack(columns, dim=2)
+        across = torch.stack([-y[..., 1], y[..., 0]], dim=-1)
+        inner = inner + across[..., None] * jacobian[..., 2:3, :]
+        c, s = out[..., 2].cos(), out[..., 2].sin()
+        columns = [_turned(inner[..., k], c, s) for k in (0, 1)]
+        return _turned(y, c, s), torch.stack(columns, dim=-1)
 
 
-class SquareMap(_FromIdentity):
+class SquareMap(FromIdentity):
     """h_i(x) = x_i + (1 − x_i²)·N_i(x): each side of the square goes to itself, corners stay.
 
     Args:
@@ -98,7 +107,7 @@ class SquareMap(_FromIdentity):
         """(N, 2) to the values (N, 2) and Jacobians (N, 2, 2)."""
         out, jacobian = self.network.value_and_jacobian(x)
         room = 1 - x * x
-        return x + room * out, torch.diag_embed(1 - 2 * x * out) + room[:, :, None] * jacobian
+        return x + room * out, torch.diag_embed(1 - 2 * x * out) + room[..., None] * jacobian
 
 
 Planar = PlanarMap | DiscMap | SquareMap
@@ -123,5 +132,5 @@ def build_planar(config: dict[str, Any]) -> Planar:
 
 
 def _turned(y: Tensor, c: Tensor, s: Tensor) -> Tensor:
-    """y (N, 2) turned by the angles whose cosine and sine (N,) are given."""
-    return torch.stack([c * y[:, 0] - s * y[:, 1], s * y[:, 0] + c * y[:, 1]], dim=1)
+    """y (..., 2) turned by the angles whose cosine and sine (...) are given."""
+    return torch.stack([c * y[..., 0] - s * y[..., 1], s * y[..., 0] + c * y[..., 1]], dim=-1)

@@ -14,7 +14,7 @@ from rich.console import Console
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
 from nsm.pipeline.common import report_surface
-from nsm.pipeline.overfit import made_once
+from nsm.pipeline.neural import made_together
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.surfaces import Surface
 from nsm.surfaces.catalogue import catalogue_mesh
@@ -146,9 +146,11 @@ def neural_surfaces(
     result: list[NeuralSurface | None] = [None if isinstance(s, Mesh) else s for s in shapes]
     if meshes:
         prepared = _prepare(config, meshes, landmarks)
-        for (k, _), surface in zip(meshes, prepared, strict=True):
+        for surface in prepared:
             report_surface(console, surface)
-            result[k] = made_once(surface, config, console)
+        made = made_together(prepared, config, console)
+        for (k, _), phi in zip(meshes, made, strict=True):
+            result[k] = phi
     return [r for r in result if r is not None]
 
 

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from pathlib import Path
 
-from filelock import FileLock
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.config import compose_config
-from nsm.errors import NsmError
 from nsm.pipeline.common import (
-    CHECKPOINT_FILE,
     built,
     configured_surface,
     plain,
@@ -29,7 +23,6 @@ from nsm.results import (
     checkerboard_picture,
     error_picture,
     export_mesh,
-    load_surface,
     metrics_table,
     overfit_metrics,
     reconstruction_image,
@@ -37,25 +30,7 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.surfaces import Surface
-from nsm.surfaces.cache import cache_folder
 from nsm.tasks import Overfit
-
-# settings that do not change what a neural surface becomes
-_INCIDENTAL = (
-    "surface",
-    "phi",
-    "logger",
-    "resume",
-    "source",
-    "target",
-    "surfaces",
-    "landmarks",
-    "attributes",
-    "artefacts",
-    "seam",
-    "constraints",
-    "guarantee",
-)
 
 
 def run_overfit(
@@ -105,50 +80,6 @@ def run_overfit(
     console.print(metrics_table(neural.metrics))
     console.print(f"results in {folder}", soft_wrap=True)
     return neural
-
-
-def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
-    """The neural surface that a map's configuration names, made if it is not there yet.
-
-    Raises:
-        NsmError: a mesh, neural surface or setting that cannot be used.
-    """
-    if config.phi.path is not None:
-        phi = load_surface(config.phi.path)
-        if phi.surface.domain != config.domain:
-            raise NsmError(
-                f"{config.phi.path}: its domain is the {phi.surface.domain}, but domain="
-                f"{config.domain}; give domain={phi.surface.domain}"
-            )
-        return phi
-    return made_once(configured_surface(config), config, console)
-
-
-def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralSurface:
-    """The neural surface of a prepared one, from the cache if it was made before.
-
-    Raises:
-        NsmError: settings in ``phi.overrides`` that cannot be used.
-    """
-    words = [
-        "task=overfit",
-        "logger=none",
-        "artefacts=false",
-        f"domain={config.domain}",
-        f"seed={config.seed}",
-    ]
-    progress = f"trainer.progress={str(config.trainer.progress).lower()}"
-    overfit = compose_config([*words, progress, *config.phi.overrides])
-    settings = {k: v for k, v in plain(overfit).items() if k not in _INCIDENTAL}
-    settings["trainer"].pop("progress")
-    text = surface.content_key() + json.dumps(settings, sort_keys=True)
-    folder = cache_folder() / "neural" / hashlib.sha256(text.encode()).hexdigest()[:32]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
-        if (folder / "metrics.json").exists():
-            console.print(f"{surface.name}: neural surface taken from the cache")
-            return load_surface(folder)
-        return run_overfit(overfit, folder, surface, resuming=(folder / CHECKPOINT_FILE).exists())
 
 
 def build_overfit(config: DictConfig, surface: Surface) -> Overfit:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from nsm.pipeline.common import built, frozen, plain, train, with_map, write_figures
 from nsm.pipeline.guarantee import guaranteed
-from nsm.pipeline.overfit import neural_surface
+from nsm.pipeline.neural import neural_surface
 from nsm.results import (
     NeuralSurface,
     Parameterization,

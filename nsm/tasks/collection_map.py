@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Rotated, build_planar
+from nsm.maps import Rotated, build_planar, together
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.terms import Distortion
 from nsm.tasks.weakest import Weakest
@@ -68,7 +68,8 @@ class CollectionMap(ConstrainedMap):
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (N, 2) of the common domain to those of all surfaces, (k, N, 2)."""
-        return torch.stack([h(x) for h in self.map])
+        every: Tensor = together(list(self.map))(x.expand(len(self.map), -1, -1))
+        return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         distortion, determinant, images = self._distortion(batch)
@@ -101,23 +102,19 @@ class CollectionMap(ConstrainedMap):
 
     def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A_i (N, k, 2, 2), det J_h (N, k) and h (N, k, 2) of all surfaces at points (N, 2)."""
-        metrics, determinants, images = [], [], []
-        for h, phi in zip(self.map, self.phis, strict=True):
-            image, inner = h.value_and_jacobian(x)  # type: ignore[operator]
-            _, outer = phi.value_and_jacobian(image)  # type: ignore[operator]
-            metrics.append(first_fundamental_form(outer @ inner))
-            determinants.append(torch.linalg.det(inner))
-            images.append(image)
-        return tuple(torch.stack(one, dim=1) for one in (metrics, determinants, images))  # type: ignore[return-value]
+        images, inner = together(list(self.map)).value_and_jacobian(x.expand(len(self.map), -1, -1))
+        _, outer = together(list(self.phis)).value_and_jacobian(images)
+        metrics = first_fundamental_form(outer @ inner)
+        return tuple(part.transpose(0, 1) for part in (metrics, torch.linalg.det(inner), images))  # type: ignore[return-value]
 
     def _seam_gap(self) -> Tensor:
         """Σ over surfaces of the mean squared distance between a seam point's two copies."""
-        both = self.seam.reshape(-1, 2)
-        total = both.new_zeros(())
-        for h, phi in zip(self.map, self.phis, strict=True):
-            a, b = phi(h(both)).reshape(-1, 2, 3).unbind(dim=1)
-            total = total + ((a - b) ** 2).sum(dim=1).mean()
-        return total
+        a, b = (
+            together(list(self.phis))(self(self.seam.reshape(-1, 2)))
+            .unflatten(1, (-1, 2))
+            .unbind(2)
+        )
+        return ((a - b) ** 2).sum(dim=-1).mean(dim=1).sum()
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
         self.log_validation(*self._distortion(batch))
@@ -127,12 +124,6 @@ class CollectionMap(ConstrainedMap):
         return torch.stack([w.flipped_percent(h) for h, w in both]).mean()  # type: ignore[operator]
 
     def landmark_error(self) -> Tensor:
-        moved = self(self.points)
-        return torch.stack(
-            [
-                100 / diagonal * (phi(a) - phi(b)).norm(dim=1)
-                for phi, a, b, diagonal in zip(
-                    self.phis, moved, self.targets, self.diagonals, strict=True
-                )
-            ]
-        )
+        phis = together(list(self.phis))
+        units = self.targets.new_tensor(self.diagonals)[:, None]
+        return 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)

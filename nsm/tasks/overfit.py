@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import pytorch_lightning as pl
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nsm.data import Samples
 from nsm.energies.overfit import normal, position
-from nsm.maps import build_map
+from nsm.maps import build_map, together
 from nsm.tasks.optimizers import configure
 from nsm.tasks.training import Training
 
@@ -77,3 +79,77 @@ class Overfit(Training):
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)
+
+
+class OverfitSeveral(Training):
+    """k surfaces at once, each as :class:`Overfit` has it, with the networks in one batch.
+
+    The loss is the sum of theirs and no network sees another's share of it, so that each becomes
+    what it would alone.
+
+    Args:
+        seed: of each network's start.
+        map, optimizer, scheduler, lambda_normal, max_steps: of each, as for :class:`Overfit`.
+        diagonals: of the surfaces' bounding boxes, the units of the errors that are logged.
+    """
+
+    progress_figure, progress_form = "val/rms_percent", "largest error {:.3f} %"
+
+    def __init__(
+        self,
+        seed: int,
+        map: dict[str, Any],
+        optimizer: dict[str, Any],
+        scheduler: dict[str, Any],
+        lambda_normal: float,
+        max_steps: int,
+        diagonals: Sequence[float],
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters(logger=False)
+        self.maps = nn.ModuleList()
+        for _ in diagonals:
+            pl.seed_everything(seed, verbose=False)
+            self.maps.append(build_map(map))
+        self.lambda_normal = lambda_normal
+        self.register_buffer("units", torch.tensor(diagonals), persistent=False)
+
+    units: Tensor
+
+    def forward(self, uv: Tensor) -> Tensor:
+        """(k, N, 2) points, N of each surface's Ω, to (k, N, 3)."""
+        every: Tensor = together(list(self.maps))(uv)
+        return every
+
+    def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        value, jacobian = self._evaluated(batch.uv)
+        terms = {"position": (1.0, position(value, batch.points).mean(dim=1).sum())}
+        if self.lambda_normal > 0:
+            turn = normal(jacobian, batch.normals).mean(dim=1).sum()
+            terms["normal"] = (self.lambda_normal, turn)
+        return self.summed(terms)
+
+    def _evaluated(self, uv: Tensor) -> tuple[Tensor, ...]:
+        """Values (k, N, 3) and Jacobians (k, N, 3, 2)."""
+
+        def by_point(x: Tensor) -> tuple[Tensor, ...]:
+            both = together(list(self.maps)).value_and_jacobian(x.transpose(0, 1))
+            return tuple(part.transpose(0, 1) for part in both)
+
+        return tuple(part.transpose(0, 1) for part in self.pointwise(by_point, uv.transpose(0, 1)))
+
+    def validation_step(self, batch: Samples, batch_idx: int) -> None:
+        value = self(batch.uv)
+        for k, squared in enumerate(position(value, batch.points).mean(dim=1)):
+            self.log(f"val/mean_squared_distance_{k}", squared, batch_size=value.shape[1])
+
+    def on_validation_epoch_end(self) -> None:
+        squared = [
+            self.trainer.callback_metrics[f"val/mean_squared_distance_{k}"]
+            for k in range(len(self.maps))
+        ]
+        error = 100 * torch.stack(squared).sqrt().to(self.units) / self.units
+        self.log("val/rms_percent", error.max())
+
+    def configure_optimizers(self) -> Any:
+        return configure(self.maps, self.hparams)

@@ -1,0 +1,109 @@
+"""Several maps evaluated in one batch, each at points of its own.
+
+A device with room for more work than one small network then does that of all at the cost of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from nsm.maps.composition import PointMap, Rotated
+from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
+from nsm.maps.networks import SKIPS, NeuralMap
+from nsm.maps.planar import FromIdentity
+from nsm.maps.trunk import Trunk
+
+
+class Alike(nn.Module):
+    """k networks with the same configuration, whose weights stay their own.
+
+    Args:
+        networks: k of them.
+    """
+
+    def __init__(self, networks: Sequence[NeuralMap]) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList(networks)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(k, N, 2) points, N for each network, to (k, N, out_dim)."""
+        return self.value_and_jacobian(x)[0]
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(k, N, 2) to the values (k, N, out_dim) and Jacobians (k, N, out_dim, 2)."""
+        networks = cast(Sequence[NeuralMap], self.networks)
+        parameters = zip(
+            *([p for m in n.layers for p in (m.weight, m.bias)] for n in networks), strict=True
+        )
+        stack = Trunk.apply(
+            self._encoded(x),
+            networks[0].activation,
+            SKIPS[networks[0].config["block"]],
+            torch.is_grad_enabled(),
+            *(torch.stack(same) for same in parameters),
+        )
+        return stack[:, 0], stack[:, 1:].permute(0, 2, 3, 1)
+
+    def _encoded(self, x: Tensor) -> Tensor:
+        encodings = [cast(NeuralMap, network).encoding for network in self.networks]
+        if isinstance(encodings[0], SplineGrid):
+            return SplineGrid.stacks_together(cast(Sequence[SplineGrid], encodings), x)
+        each = zip(encodings, x, strict=True)
+        return torch.stack([value_and_jacobian_stack(e, points) for e, points in each])
+
+
+class OneByOne(nn.Module):
+    """k maps that are not alike, evaluated one after the other.
+
+    Args:
+        maps: k of them, with images of one dimension.
+    """
+
+    def __init__(self, maps: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.maps = nn.ModuleList(maps)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(k, N, 2) points, N for each map, to (k, N, n)."""
+        return torch.stack([m(points) for m, points in zip(self.maps, x, strict=True)])
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(k, N, 2) to the values (k, N, n) and Jacobians (k, N, n, 2)."""
+        each = [
+            cast(PointMap, m).value_and_jacobian(points)
+            for m, points in zip(self.maps, x, strict=True)
+        ]
+        values, jacobians = zip(*each, strict=True)
+        return torch.stack(values), torch.stack(jacobians)
+
+
+def together(maps: Sequence[nn.Module]) -> Any:
+    """One map of points (k, N, 2), N for each of k maps, that does what they do.
+
+    Networks, planar maps and rotated ones that are alike but for their weights are evaluated in
+    one batch; any others one after the other. The weights stay their own, and gradients go to
+    them.
+
+    Args:
+        maps: k of them, with images of one dimension.
+
+    Returns:
+        A module with ``value_and_jacobian``, as each of them.
+    """
+    first = maps[0]
+    if all(isinstance(m, Rotated) for m in maps):
+        turned = cast(Sequence[Rotated], maps)
+        return Rotated.all_of(turned, together([m.inner for m in turned]))
+    if all(type(m) is type(first) for m in maps):
+        if isinstance(first, FromIdentity):
+            networks = [cast(FromIdentity, m).network for m in maps]
+            return type(first).around(together(networks))
+        if isinstance(first, NeuralMap) and first.config["block"] in SKIPS:
+            alike = cast(Sequence[NeuralMap], maps)
+            if all(m.config == first.config for m in alike):
+                return Alike(alike)
+    return OneByOne(maps)
