@@ -12,6 +12,10 @@ from nsm.surfaces.geometry import point_mesh_distance, subdivide
 
 # A triangle whose area φ shrinks below this share of the true one has collapsed.
 DEGENERATE_STRETCH = 1e-3
+# A mesh of so many triangles shows φ as it is; those with fewer are split.
+FINE_ENOUGH = 500_000
+# of φ whose distance to the mesh is measured
+MOST_POINTS = 500_000
 
 
 def vertex_error(surface: Surface, phi: nn.Module) -> np.ndarray:
@@ -52,10 +56,13 @@ def overfit_metrics(
     angle = _angles(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]), normals[face])
 
     # φ's surface as a mesh finer than the source, for the distances between the two
-    fine_uv, fine_faces = subdivide(surface.uv, surface.faces)
+    fine_uv, fine_faces = surface.uv, surface.faces
+    if len(fine_faces) < FINE_ENOUGH:
+        fine_uv, fine_faces = subdivide(fine_uv, fine_faces)
     image = evaluate(phi, fine_uv)
     there = point_mesh_distance(points, image, fine_faces)
-    back = point_mesh_distance(image, surface.vertices, surface.faces)
+    some = image[:: len(image) // MOST_POINTS + 1]
+    back = point_mesh_distance(some, surface.vertices, surface.faces)
     seam = surface.uv[surface.twins.ravel()]
     gap = np.zeros(1)
     if len(seam):

@@ -54,12 +54,15 @@ class _Graph:
         order = np.lexsort((self.length, high, low))
         order = order[low[order] != high[order]]
         key = low[order] * len(vertices) + high[order]
-        keep = order[np.unique(key, return_index=True)[1]]
-        n = len(vertices)
+        self.keys, first = np.unique(key, return_index=True)
+        self.kept = keep = order[first]
+        n = self.n = len(vertices)
         self.matrix = csr_matrix((self.length[keep], (low[keep], high[keep])), shape=(n, n))
-        self.edge_of = {
-            (int(a), int(b)): int(e) for a, b, e in zip(low[keep], high[keep], keep, strict=True)
-        }
+
+    def edge(self, a: int | np.ndarray, b: int | np.ndarray) -> np.ndarray:
+        """The edges, as numbered in the mesh, between neighbouring nodes."""
+        key = np.minimum(a, b) * self.n + np.maximum(a, b)
+        return self.kept[np.searchsorted(self.keys, key)]
 
     def distances(self, sources: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Distance to the nearest source and the predecessor on the way there, per node."""
@@ -77,7 +80,7 @@ class _Graph:
         nodes, edges = [node], []
         while predecessor[node] >= 0:
             previous = int(predecessor[node])
-            edges.append(self.edge_of[(min(node, previous), max(node, previous))])
+            edges.append(int(self.edge(node, previous)))
             nodes.append(previous)
             node = previous
         return nodes, edges
@@ -131,12 +134,10 @@ def cut_along_paths(
     NsmError if that does not leave a disc.
     """
     edges = topology.edges_of(faces)
-    number = {(int(a), int(b)): e for e, (a, b) in enumerate(edges.pairs)}
-    seam = [
-        number[(min(a, b), max(a, b))]
-        for path in paths
-        for a, b in zip(path[:-1], path[1:], strict=True)
-    ]
+    keys = edges.pairs[:, 0] * len(vertices) + edges.pairs[:, 1]  # in rising order
+    steps = [np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1) for path in paths]
+    low, high = np.concatenate(steps).astype(np.int64).T
+    seam = np.searchsorted(keys, low * len(vertices) + high).tolist()
     log = [f"cut along {len(seam)} edges between {len(paths) + 1} landmarks"]
     return _opened(vertices, faces, seam, log, name)
 
@@ -229,9 +230,8 @@ def _open_handles(
     distance, predecessor = graph.distances(nodes)
     blocked = edges.count == 1
     blocked[seam] = True
-    for node in np.flatnonzero(predecessor >= 0).tolist():
-        previous = int(predecessor[node])
-        blocked[graph.edge_of[(min(node, previous), max(node, previous))]] = True
+    reached = np.flatnonzero(predecessor >= 0)
+    blocked[graph.edge(reached, predecessor[reached].astype(np.int64))] = True
     # longest loops go into the dual spanning tree, so that the shortest ones are left over
     loop_length = distance[graph.ends].sum(axis=1) + graph.length
     free = np.flatnonzero(~blocked)
@@ -248,20 +248,14 @@ def _open_handles(
     weight = 1.0 + (longest - loop_length[crossing[keep]]) / longest
     dual = csr_matrix((weight, (low[keep], high[keep])), shape=(n_faces, n_faces))
     tree = minimum_spanning_tree(dual).tocoo()
-    crossed_pairs = set(
-        (np.minimum(tree.row, tree.col) * n_faces + np.maximum(tree.row, tree.col)).tolist()
-    )
-    crossed = {
-        int(e)
-        for e, a, b in zip(crossing[keep], low[keep], high[keep], strict=True)
-        if int(a) * n_faces + int(b) in crossed_pairs
-    }
+    row, column = tree.row.astype(np.int64), tree.col.astype(np.int64)
+    in_tree = np.minimum(row, column) * n_faces + np.maximum(row, column)
+    crossed = crossing[keep[np.isin(low[keep] * n_faces + high[keep], in_tree)]]
     result: list[int] = []
-    for edge in free.tolist():
-        if edge not in crossed:
-            result.append(edge)
-            for end in graph.ends[edge].tolist():
-                result += graph.path(predecessor, end)[1]
+    for edge in np.setdiff1d(free, crossed).tolist():
+        result.append(edge)
+        for end in graph.ends[edge].tolist():
+            result += graph.path(predecessor, end)[1]
     return result
 
 

@@ -5,7 +5,8 @@ the mesh. SLIM (Rabinovich et al. 2017, "Scalable Locally Injective Mappings") t
 symmetric Dirichlet energy: libigl's with the boundary held, which is fast, and after it our own
 steps, in which boundary vertices slide along the boundary of the domain. Our steps keep the
 boundary exactly on the domain's and never accept a flipped triangle, which libigl's soft
-constraints cannot promise.
+constraints cannot promise. Large meshes are laid out coarse first
+(:mod:`nsm.surfaces.multiresolution`).
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.multiresolution import laid_out
 from nsm.surfaces.predicates import orientation
 
 DOMAINS = ("disc", "square")
 # slim_held: SLIM without the sliding steps after it, a quick look at what slim would give
 METHODS = ("tutte", "slim_held", "slim")
 DOMAIN_AREA = {"disc": float(np.pi), "square": 4.0}
+# more faces than this are laid out coarse first
+LARGE, COARSE = 40_000, 12_000
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -41,10 +45,12 @@ class Keys:
 
 @dataclass(frozen=True)
 class Parameterization:
-    """uv (V,2) in the domain, tutte (V,2) where it started, log."""
+    """uv (V,2) in the domain; medians of symmetric Dirichlet, its own and that of Tutte's embedding
+    (for a mesh laid out coarse first, of the coarse one); log."""
 
     uv: np.ndarray
-    tutte: np.ndarray
+    distortion: float
+    tutte_distortion: float
     log: tuple[str, ...]
 
 
@@ -72,6 +78,57 @@ def parameterize(
     log: list[str] = []
     loop = topology.boundary_loops(faces)[0]
     boundary = boundary_positions(vertices, loop, domain, name, keys)
+    held = np.zeros(len(vertices), dtype=bool)
+    if domain == "square":
+        held[loop[np.abs(boundary).min(axis=1) == 1.0]] = True
+    if keys is not None:
+        held[keys.vertices] = True
+
+    before = float("nan")
+
+    def solve(
+        points: np.ndarray,
+        triangles: np.ndarray,
+        rim: np.ndarray,
+        at: np.ndarray,
+        stay: np.ndarray,
+    ) -> np.ndarray:
+        nonlocal before
+        start = _start(points, triangles, rim, at, name, log)
+        before = _median_distortion(points, triangles, start)
+        if method == "tutte":
+            return start
+        uv = _slim_held(points, triangles, start, rim, at, log)
+        steps = _sliding_steps(len(triangles)) if method == "slim" else 0
+        uv = slide(points, triangles, uv, rim, domain, steps, stay)
+        if flipped_triangles(uv, triangles) or boundary_self_intersections(uv, rim):
+            log.append("SLIM result was not injective: Tutte's embedding kept")
+            return start
+        return uv
+
+    uv = None
+    if method != "tutte" and len(faces) > LARGE:
+        uv = laid_out(vertices, faces, loop, boundary, domain, held, solve, COARSE)
+        if uv is not None and (
+            flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop)
+        ):
+            uv = None
+        if uv is None:
+            log[:] = ["a coarse mesh's layout did not carry over: laid out at once"]
+    if uv is None:
+        uv = solve(vertices, faces, loop, boundary, held)
+    return Parameterization(uv, _median_distortion(vertices, faces, uv), before, tuple(log))
+
+
+def _start(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    loop: np.ndarray,
+    boundary: np.ndarray,
+    name: str,
+    log: list[str],
+) -> np.ndarray:
+    """Tutte's embedding (V,2), checked; NsmError if it has flips."""
     start = tutte(vertices, faces, loop, boundary)
     if flipped_triangles(start, faces):
         start = tutte(vertices, faces, loop, boundary, weights="mean_value")
@@ -82,15 +139,7 @@ def parameterize(
             f"{name}: {flipped} triangles flip in Tutte's embedding (parts too long and thin for "
             "floating point); give seam_vertices at the tips of long parts"
         )
-    uv = start
-    if method != "tutte":
-        held = _slim_held(vertices, faces, start, loop, boundary, log)
-        steps = _sliding_steps(len(faces)) if method == "slim" else 0
-        uv = slide(vertices, faces, held, loop, domain, steps, keys)
-        if flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop):
-            uv = start
-            log.append("SLIM result was not injective: Tutte's embedding kept")
-    return Parameterization(uv, start, tuple(log))
+    return start
 
 
 def boundary_positions(
@@ -285,9 +334,9 @@ def slide(
     loop: np.ndarray,
     domain: str,
     steps: int,
-    keys: Keys | None = None,
+    held: np.ndarray,
 ) -> np.ndarray:
-    """SLIM steps from an injective uv (V,2) with boundary vertices, but for keys, free to slide.
+    """SLIM steps from an injective uv (V,2), boundary vertices free to slide but for held (V,).
 
     Each step solves SLIM's weighted least-squares proxy in the remaining freedom (two coordinates
     inside, one along the boundary, none at the corners of the square), then searches along it for
@@ -297,9 +346,7 @@ def slide(
     on_boundary = np.zeros(len(uv), dtype=bool)
     on_boundary[loop] = True
     inner = np.flatnonzero(~on_boundary)
-    moving = loop if domain == "disc" else loop[np.abs(uv[loop]).min(axis=1) < 1.0]
-    if keys is not None:
-        moving = moving[~np.isin(moving, keys.vertices)]
+    moving = loop[~held[loop]]
     energy = _energy(gradient, area, faces, uv)
     for _ in range(steps):
         direction = _proxy_step(gradient, area, faces, uv, inner, moving, domain)
@@ -549,3 +596,7 @@ def symmetric_dirichlet_per_face(
         p, r = metric[:, 0, 0] + eps, metric[:, 1, 1] + eps
         value = trace + (p + r) / (p * r - metric[:, 0, 1] ** 2)
     return np.where(determinant != 0, value, np.inf)
+
+
+def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:
+    return float(np.median(symmetric_dirichlet_per_face(vertices, faces, uv)))

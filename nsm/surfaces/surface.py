@@ -26,7 +26,6 @@ from nsm.surfaces.parameterization import (
     boundary_self_intersections,
     flipped_triangles,
     parameterize,
-    symmetric_dirichlet_per_face,
 )
 from nsm.surfaces.validation import clean
 
@@ -118,7 +117,8 @@ class Surface:
 
         ``quality`` holds flipped_triangles, boundary_self_intersections (both 0, or this raises),
         median_symmetric_dirichlet and tutte_median_symmetric_dirichlet (of the map from Ω to the
-        mesh), seam_vertices (how many doubled vertices) and seconds.
+        mesh; Tutte's of a large mesh is that of the coarse one that it is laid out by),
+        seam_vertices (how many doubled vertices) and seconds.
 
         Raises:
             NsmError: the mesh cannot be repaired, cut or flattened without flips.
@@ -211,10 +211,8 @@ class Surface:
         quality = {
             "flipped_triangles": float(flipped),
             "boundary_self_intersections": float(crossings),
-            "median_symmetric_dirichlet": _median_distortion(normalised, cut.faces, flat.uv),
-            "tutte_median_symmetric_dirichlet": _median_distortion(
-                normalised, cut.faces, flat.tutte
-            ),
+            "median_symmetric_dirichlet": flat.distortion,
+            "tutte_median_symmetric_dirichlet": flat.tutte_distortion,
             "seam_vertices": float(len(cut.twins)),
             "seconds": time.perf_counter() - start,
         }
@@ -292,7 +290,3 @@ class Surface:
                 )
             result[row] = self.uv[found[0]]
         return result
-
-
-def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:
-    return float(np.median(symmetric_dirichlet_per_face(vertices, faces, uv)))

@@ -1,0 +1,197 @@
+"""Meshes drawn together vertex by vertex, so that each step can be undone in the plane.
+
+A step draws a vertex into a neighbour (half-edge collapse; Hoppe 1996, "Progressive meshes"). What
+it leaves is a fan of triangles around that neighbour; wherever these lie in the plane, without
+flips, there is room near the neighbour to put the vertex back without flips (Sander et al. 2002,
+"Signal-specialized parametrization"). Many steps that do not touch each other make a round, which
+is computed at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+# A new triangle's normal may turn by 70°, and its double area over its squared sides (0.29 if they
+# are equal) may not be below this and the old one's.
+_TURN, _SHAPE = 0.34, 0.03
+_MOST_NEIGHBOURS = 12
+_FEWEST_ON_BOUNDARY = 32
+_LEAST_SHARE = 0.005  # of the vertices: rounds that remove fewer are the last
+
+
+@dataclass(frozen=True)
+class Round:
+    """Vertices (N,) that were drawn into neighbours, target (N,), none near another.
+
+    before: (N,) the other neighbour on the boundary of a vertex on it, -1 inside. corners (M,):
+    the places 3f + k in the list of faces that named these vertices, and name their targets now;
+    star (M,), which of the N each belonged to.
+    """
+
+    vertex: np.ndarray
+    target: np.ndarray
+    before: np.ndarray
+    corners: np.ndarray
+    star: np.ndarray
+
+    def chosen(self, keep: np.ndarray) -> Round:
+        """That of a mask (N,) of the vertices."""
+        mine, number = keep[self.star], np.cumsum(keep) - 1
+        return Round(
+            self.vertex[keep],
+            self.target[keep],
+            self.before[keep],
+            self.corners[mine],
+            number[self.star[mine]],
+        )
+
+
+def coarsen(
+    vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, count: int
+) -> tuple[np.ndarray, list[Round]]:
+    """Draw a mesh (V, 3), (F, 3) of disc shape together until about ``count`` faces are left.
+
+    Vertices stay where they are. No inner edge comes to join two boundary vertices.
+
+    Args:
+        held: (V,) mask of vertices that stay.
+
+    Returns:
+        the faces (F, 3), those that are gone with two equal corners, and the rounds.
+    """
+    faces, flat = faces.copy(), np.arange(3)
+    alive = np.arange(len(faces))
+    rng = np.random.default_rng(0)
+    rounds: list[Round] = []
+    while len(alive) > count:
+        present = faces[alive]
+        used = np.zeros(len(vertices), dtype=bool)
+        used[present] = True
+        ids, local = np.flatnonzero(used), np.cumsum(used) - 1
+        vertex, target, before = _collapses(vertices[ids], local[present], held[ids], rng)
+        if len(vertex) < _LEAST_SHARE * len(ids):
+            break
+        number = np.full(len(vertices), -1)
+        number[ids[vertex]] = np.arange(len(vertex))
+        star = number[present]
+        touched = star >= 0
+        corners = (3 * alive[:, None] + flat)[touched]
+        star = star[touched]
+        faces.ravel()[corners] = ids[target][star]
+        rounds.append(
+            Round(ids[vertex], ids[target], np.where(before < 0, -1, ids[before]), corners, star)
+        )
+        alive = alive[_has_area(faces[alive])]
+    return faces, rounds
+
+
+def undo(faces: np.ndarray, step: Round) -> None:
+    """Put a round's vertices back into the faces (F, 3)."""
+    faces.ravel()[step.corners] = step.vertex[step.star]
+
+
+def present_faces(faces: np.ndarray) -> np.ndarray:
+    """Those of the faces (F, 3) that are not gone."""
+    return faces[_has_area(faces)]
+
+
+def _has_area(faces: np.ndarray) -> np.ndarray:
+    a, b, c = faces.T
+    return (a != b) & (b != c) & (c != a)
+
+
+class Rings:
+    """The neighbours of each vertex: indices[start[v] : start[v + 1]], n vertices, all in faces."""
+
+    def __init__(self, faces: np.ndarray, n: int) -> None:
+        tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        once = csr_matrix((np.ones(len(tail), dtype=np.int8), (tail, head)), shape=(n, n))
+        self.matrix = (once + once.T).tocsr()  # 1 on the boundary, 2 inside
+        self.start, self.indices = self.matrix.indptr[:-1], self.matrix.indices
+        self.degree = np.diff(self.matrix.indptr)
+        self.row = np.repeat(np.arange(n), self.degree)
+
+    def least(self, value: np.ndarray) -> np.ndarray:
+        """The least value (N,) over each vertex and its neighbours."""
+        return np.minimum(value, np.minimum.reduceat(value[self.indices], self.start))
+
+    def apart(self, priority: np.ndarray, distance: int) -> np.ndarray:
+        """Mask (N,) of vertices, of finite priority and lowest first, more than 1 or 2 edges apart.
+
+        Not all that could be added are there.
+        """
+        priority, chosen = priority.copy(), np.zeros(len(priority), dtype=bool)
+        for _ in range(3):
+            lowest = priority
+            for _ in range(distance):
+                lowest = self.least(lowest)
+            chosen |= np.isfinite(priority) & (priority == lowest)
+            near = np.where(chosen, -1.0, 0.0)
+            for _ in range(distance):
+                near = self.least(near)
+            priority[near < 0] = np.inf
+        return chosen
+
+
+def _collapses(
+    points: np.ndarray, faces: np.ndarray, held: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (N,) to be drawn into neighbours, these, and the others before them on the rim."""
+    n = len(points)
+    rings = Rings(faces, n)
+    row, column, on_rim = rings.row, rings.indices, rings.matrix.data == 1
+    rim = np.bincount(row[on_rim], minlength=n) > 0
+    rim_neighbours = np.bincount(row, weights=rim[column], minlength=n)
+    # an inner vertex goes to the boundary only if that makes no chord; one of the boundary along it
+    allowed = np.where(rim[row], on_rim & (rim_neighbours[row] == 2), True)
+    allowed &= rim[row] | ~rim[column] | (rim_neighbours[row] == 1)
+    allowed &= ~held[row]
+    if rim.sum() <= _FEWEST_ON_BOUNDARY:
+        allowed &= ~rim[row]
+    length = np.linalg.norm(points[row] - points[column], axis=1)
+    # chance makes what fails in one round be tried otherwise in the next
+    cost = np.where(allowed, length * rng.uniform(1.0, 1.7, len(row)), np.inf)
+    least = np.minimum.reduceat(cost, rings.start)
+    place = np.flatnonzero(np.isfinite(cost) & (cost == least[row]))
+    vertex, first = np.unique(row[place], return_index=True)
+    target = column[place[first]]
+
+    ones = rings.matrix.copy()
+    ones.data = np.ones(len(row), dtype=np.int16)
+    common = np.asarray(ones[vertex].multiply(ones[target]).sum(axis=1)).ravel()
+    good = common == np.where(rim[vertex], 1, 2)
+    good &= rings.degree[vertex] + rings.degree[target] - 4 <= _MOST_NEIGHBOURS
+    vertex, target = vertex[good], target[good]
+    into = np.full(n, -1)
+    into[vertex] = target
+    spoilt = _spoilt(points, faces, into)
+    priority = np.where((into >= 0) & ~spoilt, least, np.inf)
+    vertex = np.flatnonzero(rings.apart(priority, 2))
+    # the neighbour on the boundary that a vertex is not drawn into
+    before = np.full(n, -1)
+    other = on_rim & (column != into[row])
+    before[row[other]] = column[other]
+    return vertex, into[vertex], np.where(rim[vertex], before[vertex], -1)
+
+
+def _spoilt(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
+    """Mask (N,) of vertices that leave bad triangles if they are drawn into others, ``into``."""
+    spoilt = np.zeros(len(points), dtype=bool)
+    for k in range(3):
+        v, b, c = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        w = into[v]
+        kept = (w >= 0) & (w != b) & (w != c)
+        v, w, b, c = (points[i[kept]] for i in (v, w, b, c))
+        old, new = np.cross(b - v, c - v), np.cross(b - w, c - w)
+        double = np.linalg.norm(new, axis=1)
+        before = np.linalg.norm(old, axis=1)
+        side = ((b - c) ** 2).sum(axis=1)
+        shape = double / (side + ((b - w) ** 2).sum(axis=1) + ((c - w) ** 2).sum(axis=1))
+        shape_before = before / (side + ((b - v) ** 2).sum(axis=1) + ((c - v) ** 2).sum(axis=1))
+        bad = (old * new).sum(axis=1) < _TURN * double * before
+        bad |= shape < np.minimum(_SHAPE, shape_before)
+        spoilt[faces[kept, k][bad]] = True
+    return spoilt

@@ -1,0 +1,227 @@
+"""Flat meshes whose vertices move one by one to where their triangles are least distorted.
+
+The energy is that of :mod:`nsm.surfaces.parameterization`: symmetric Dirichlet, weighted by the
+area on the mesh. Vertices that are no neighbours move at once; a step that would flip a triangle
+or not lower the energy is shortened, or not made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nsm.surfaces.coarsening import Rings
+
+_TRIES, _SHORTER = 4, 0.35
+_COLOURS = 64
+
+
+@dataclass
+class Stars:
+    """The triangles around some vertices (N,), no two of which are neighbours.
+
+    For each of M corners at them: star (M,), whose it is; b and c (M,), the triangle's others,
+    counter-clockwise; and of its shape on the mesh, a = |g|²A, e = g·g_c A, f = |g_c|²A, with the
+    gradients g, g_c of the hat functions and the area A, and d = 1 / 2A.
+    """
+
+    vertex: np.ndarray
+    star: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    a: np.ndarray
+    e: np.ndarray
+    f: np.ndarray
+    d: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        vertices: np.ndarray,
+        vertex: np.ndarray,
+        star: np.ndarray,
+        b: np.ndarray,
+        c: np.ndarray,
+    ) -> Stars:
+        """The stars' triangles (vertex[star], b, c) with their shapes in a mesh (V, 3)."""
+        p, q, r = vertices[vertex[star]], vertices[b], vertices[c]
+        u, v, w = q - p, r - p, r - q
+        double = np.linalg.norm(np.cross(u, v), axis=1)
+        # hat functions' gradients have the dots |w|² / 4A² and, between p and r, (u·w) / 4A²
+        half = 0.5 / double
+        return cls(
+            vertex,
+            star,
+            b,
+            c,
+            (w * w).sum(axis=1) * half,
+            (u * w).sum(axis=1) * half,
+            (u * u).sum(axis=1) * half,
+            1 / double,
+        )
+
+    def chosen(self, keep: np.ndarray) -> Stars:
+        """Those of the stars that a mask (N,) keeps."""
+        corners = keep[self.star]
+        number = np.cumsum(keep) - 1
+        parts = (getattr(self, name)[corners] for name in ("b", "c", "a", "e", "f", "d"))
+        return Stars(self.vertex[keep], number[self.star[corners]], *parts)
+
+    def energy(self, uv: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Energy (N,) of each star with its vertex at (N, 2); inf where a triangle has no area."""
+        x, y = at[self.star] - uv[self.b], uv[self.c] - uv[self.b]
+        det = (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) * self.d
+        return self._sum(np.where(det > 0, self._dirichlet(x, y) * (1 + self._power(det)), np.inf))
+
+    def _dirichlet(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return (
+            self.a * (x * x).sum(axis=1)
+            + 2 * self.e * (x * y).sum(axis=1)
+            + self.f * (y * y).sum(axis=1)
+        )
+
+    @staticmethod
+    def _power(det: np.ndarray) -> np.ndarray:
+        return 1 / np.where(det > 0, det, 1.0) ** 2
+
+    def _sum(self, values: np.ndarray) -> np.ndarray:
+        return np.bincount(self.star, weights=values, minlength=len(self.vertex))
+
+    def derivatives(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Energy (N,), gradient (N, 2) and second derivatives xx, xy, yy (N, 3) as they lie."""
+        x, y = uv[self.vertex[self.star]] - uv[self.b], uv[self.c] - uv[self.b]
+        det = (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) * self.d
+        q = self._dirichlet(x, y)
+        p2 = 1 / det**2
+        p3 = -2 * p2 / det
+        q4 = 6 * q * p2**2
+        qx, qy = (2 * (self.a * x[:, i] + self.e * y[:, i]) for i in range(2))
+        nx, ny = -y[:, 1] * self.d, y[:, 0] * self.d
+        one = 1 + p2
+        gradient = [one * g + p3 * q * n for g, n in ((qx, nx), (qy, ny))]
+        round_ = 2 * self.a * one
+        second = [
+            round_ + 2 * p3 * qx * nx + q4 * nx * nx,
+            p3 * (qx * ny + qy * nx) + q4 * nx * ny,
+            round_ + 2 * p3 * qy * ny + q4 * ny * ny,
+        ]
+        return (
+            self._sum(q * one),
+            np.stack([self._sum(g) for g in gradient], axis=1),
+            np.stack([self._sum(h) for h in second], axis=1),
+        )
+
+
+class Slopes:
+    """Where vertices may move: freely, or, those of a mask (V,), along ∂Ω; some not at all."""
+
+    def __init__(self, rim: np.ndarray, held: np.ndarray, domain: str) -> None:
+        self.rim, self.held, self.domain = rim, held, domain
+
+    def tangent(self, uv: np.ndarray) -> np.ndarray:
+        if self.domain == "disc":
+            return np.stack([-uv[:, 1], uv[:, 0]], axis=1)
+        on_vertical = np.abs(uv[:, 0]) > np.abs(uv[:, 1])
+        return np.stack([~on_vertical, on_vertical], axis=1).astype(np.float64)
+
+    def back(self, points: np.ndarray, rim: np.ndarray) -> np.ndarray:
+        """Points (N, 2), those of a mask (N,) brought back to ∂Ω."""
+        on = points[rim]
+        if self.domain == "disc":
+            points[rim] = on / np.linalg.norm(on, axis=1, keepdims=True)
+        else:
+            points[rim] = on.clip(-1.0, 1.0)
+        return points
+
+
+def relax(uv: np.ndarray, stars: Stars, slopes: Slopes) -> None:
+    """One Newton step of each of the stars' vertices, within uv (V, 2)."""
+    energy, gradient, second = stars.derivatives(uv)
+    rim, here = slopes.rim[stars.vertex], uv[stars.vertex]
+    direction = _newton(gradient, second)
+    if rim.any():
+        t, g, h = slopes.tangent(here[rim]), gradient[rim], second[rim]
+        along = (g * t).sum(axis=1)
+        bend = h[:, 0] * t[:, 0] ** 2 + 2 * h[:, 1] * t[:, 0] * t[:, 1] + h[:, 2] * t[:, 1] ** 2
+        if slopes.domain == "disc":
+            bend = bend - (g * here[rim]).sum(axis=1)
+        bend = np.maximum(bend, 0.1 * np.abs(h[:, 0] + h[:, 2]))
+        direction[rim] = -(along / bend)[:, None] * t
+    size = np.minimum(1.0, 0.8 * _first_collapse(uv, stars, direction))
+    active = np.isfinite(direction).all(axis=1) & ~slopes.held[stars.vertex]
+    some, index = stars.chosen(active), np.flatnonzero(active)
+    for _ in range(_TRIES):
+        if len(index) == 0:
+            return
+        trial = here[index] + size[index, None] * direction[index]
+        trial = slopes.back(trial, rim[index])
+        better = some.energy(uv, trial) < energy[index]
+        uv[some.vertex[better]] = trial[better]
+        size[index] *= _SHORTER
+        some, index = some.chosen(~better), index[~better]
+
+
+def _newton(gradient: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Steps (N, 2) of Newton's method, with eigenvalues of 2×2 matrices made positive."""
+    xx, xy, yy = second.T
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    radius = np.hypot(half, xy)
+    low = mean - radius
+    # λ I added where the lower eigenvalue is not clearly above zero
+    shift = np.maximum(0.05 * (np.abs(mean) + radius) - low, 0.0)
+    xx, yy = xx + shift, yy + shift
+    determinant = xx * yy - xy**2
+    gx, gy = gradient.T
+    return -np.stack([yy * gx - xy * gy, xx * gy - xy * gx], axis=1) / determinant[:, None]
+
+
+def _first_collapse(uv: np.ndarray, stars: Stars, direction: np.ndarray) -> np.ndarray:
+    """The multiple (N,) of each step (N, 2) at which a triangle of the star loses its area."""
+    x, y = uv[stars.vertex[stars.star]] - uv[stars.b], uv[stars.c] - uv[stars.b]
+    area = y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]
+    by = direction[stars.star]
+    change = y[:, 0] * by[:, 1] - y[:, 1] * by[:, 0]
+    rate = np.zeros(len(stars.vertex))
+    np.maximum.at(rate, stars.star, -change / area)
+    return 1 / np.maximum(rate, 1e-300)
+
+
+def sweep(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, slopes: Slopes, sweeps: int
+) -> None:
+    """Relax all vertices that the faces (F, 3) name, one independent set after the other.
+
+    Args:
+        vertices: (V, 3) the mesh, which should have the area of the domain.
+        uv: (V, 2), not flipped; changed in place.
+        sweeps: how often all are gone through.
+    """
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    ids, local = np.flatnonzero(used), np.cumsum(used) - 1
+    colour = _colours(local[faces], len(ids))
+    owner = faces.ravel()
+    b, c = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
+    of_corner = colour[local[owner]]
+    number = np.zeros(len(vertices), dtype=np.int64)
+    groups = []
+    for k in range(int(colour.max()) + 1):
+        mine, members = np.flatnonzero(of_corner == k), ids[colour == k]
+        number[members] = np.arange(len(members))
+        groups.append(Stars.of(vertices, members, number[owner[mine]], b[mine], c[mine]))
+    for _ in range(sweeps):
+        for stars in groups:
+            relax(uv, stars, slopes)
+
+
+def _colours(faces: np.ndarray, n: int) -> np.ndarray:
+    """Numbers (N,) that differ between neighbours."""
+    rings, rng = Rings(faces, n), np.random.default_rng(0)
+    colour = np.full(n, -1)
+    for k in range(_COLOURS):
+        free = colour < 0
+        if not free.any():
+            break
+        colour[rings.apart(np.where(free, rng.uniform(size=n), np.inf), 1) & free] = k
+    return colour
