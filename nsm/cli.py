@@ -19,7 +19,7 @@ from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
 # input. Imported only when called for.
-COMMANDS: dict[str, str] = {"report": "nsm.commands.report"}
+COMMANDS: dict[str, str] = {"report": "nsm.commands.report", "view": "nsm.commands.view"}
 
 
 def _run(config: DictConfig) -> bool:

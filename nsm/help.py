@@ -20,6 +20,7 @@ Neural surface maps: meshes as networks, and maps between them.
   nsm -m sweep=NAME ...                          a sweep that is ready
   nsm resume=FOLDER                              go on with an interrupted run
   nsm report FOLDER...                           compare runs in one page
+  nsm view FOLDER                                turn and click a run's shapes in the browser
   nsm --help GROUP                               the settings of a group, with remarks
   nsm --cfg job [...]                            the settings that a run would have"""
 

@@ -20,6 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nsm.errors import NsmError
+from nsm.extras import needed
 from nsm.sweeps import OUTCOMES, Job, Outcome, is_complete, job_folder, swept_keys
 
 _KILLED = "its process was killed, perhaps for want of memory"
@@ -234,18 +235,6 @@ class Ray(SweepLauncher):
 
 
 _RAY = {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"}
-
-
-def needed(package: str, what: str) -> Any:
-    """A package of an extra.
-
-    Raises:
-        NsmError: it is not installed.
-    """
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise NsmError(f"{what} needs {package}: pip install 'nsm[{package}]'") from error
 
 
 def _told(place: Path, settings: dict[str, Any], folder: str, cwd: str) -> tuple[Path, str | None]:

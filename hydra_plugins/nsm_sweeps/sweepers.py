@@ -17,8 +17,8 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from hydra_plugins.nsm_sweeps.launchers import needed
 from nsm.errors import NsmError
+from nsm.extras import needed
 from nsm.sweeps import Outcome, overrides_of
 
 _SAMPLERS = {

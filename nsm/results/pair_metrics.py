@@ -37,6 +37,14 @@ ON_BOUNDARY = 1e-6
 _COVER_SAMPLES = 20_000
 
 
+def triangle_energies(
+    source: np.ndarray, image: np.ndarray, faces: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Each energy (F,) of the triangles, by name; arguments as of :func:`distortion_figures`."""
+    a, b = triangle_metric(source, faces), triangle_metric(image, faces)
+    return {energy.__name__: energy(a, b).numpy() for energy in ENERGIES}
+
+
 def distortion_figures(
     source: np.ndarray, image: np.ndarray, faces: np.ndarray
 ) -> dict[str, float]:
@@ -47,12 +55,9 @@ def distortion_figures(
         image: where they go, (V, 3) or (V, 2).
         faces: (F, 3).
     """
-    a, b = triangle_metric(source, faces), triangle_metric(image, faces)
     weights = face_areas(source, faces)
     figures: dict[str, float] = {}
-    for energy in ENERGIES:
-        value = energy(a, b).numpy()
-        name = energy.__name__
+    for name, value in triangle_energies(source, image, faces).items():
         figures[f"{name}_median"] = float(np.median(value))
         figures[f"{name}_mean"] = float(np.average(value, weights=weights))
         figures[f"{name}_p95"] = float(np.percentile(value, 95))

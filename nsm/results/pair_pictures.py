@@ -13,7 +13,7 @@ from PIL import Image
 from nsm.energies import symmetric_dirichlet
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
-from nsm.results.pictures import PANEL, checked, panels, save_figure
+from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
 from nsm.results.render import Blend, View
 from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces import Surface
@@ -54,12 +54,9 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     value = symmetric_dirichlet(
         triangle_metric(s.vertices, s.faces), triangle_metric(f.image, s.faces)
     ).numpy()
-    at_vertex = np.zeros(len(s.vertices))
-    count = np.zeros(len(s.vertices))
-    np.add.at(at_vertex, s.faces.ravel(), np.repeat(np.minimum(value, 1e3), 3))
-    np.add.at(count, s.faces.ravel(), 1)
+    at_vertex = vertex_means(np.minimum(value, 1e3), s.faces, len(s.vertices))
     scale = ScalarMappable(LogNorm(4, _WORST), "viridis")
-    colours = scale.to_rgba(at_vertex / np.maximum(count, 1))[:, :3]
+    colours = scale.to_rgba(at_vertex)[:, :3]
 
     def paint(blend: Blend) -> np.ndarray:
         return blend(colours)

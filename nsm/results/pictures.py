@@ -24,7 +24,7 @@ from nsm.surfaces.geometry import subdivide
 if TYPE_CHECKING:
     from nsm.results.artifact import NeuralSurface
 
-_GREY = np.array([0.80, 0.82, 0.85])
+GREY = np.array([0.80, 0.82, 0.85])
 PANEL = 640
 # the reconstruction is drawn with at least this many triangles, so that φ itself is seen
 _FINE_FACES = 30_000
@@ -74,7 +74,7 @@ def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -
 
 
 def _grey(blend: Blend) -> np.ndarray:
-    return _GREY
+    return GREY
 
 
 def _fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
@@ -103,6 +103,14 @@ def layout_image(surface: Surface, uv: np.ndarray, *, size: int = 384) -> np.nda
     """A map (V, 2) of the mesh as it lies in the plane, (size, size, 3) in [0, 1]."""
     flat = np.column_stack([uv, np.zeros(len(uv))])
     return View(flat, size, frame=np.eye(3)).draw(flat, surface.faces, checked(uv))
+
+
+def vertex_means(values: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
+    """At each of ``count`` vertices the mean (V,) of the values (F,) of the faces around it."""
+    total, number = np.zeros(count), np.zeros(count)
+    np.add.at(total, faces.ravel(), np.repeat(values, 3))
+    np.add.at(number, faces.ravel(), 1)
+    return total / np.maximum(number, 1)
 
 
 def checked(uv: np.ndarray) -> Callable[[Blend], np.ndarray]:

@@ -139,7 +139,7 @@ class View:
             return (weights[:, :, None] * values[corners]).sum(axis=1)
 
         base = colours(blend)
-        normal = blend(_vertex_normals(turned, faces))
+        normal = blend(vertex_normals(turned, faces))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
         facing = np.where(normal[:, 2:] < 0, -normal, normal)
         lit = 0.38 + 0.62 * np.clip(facing @ _LIGHT, 0, 1)
@@ -150,7 +150,8 @@ class View:
         return blocks.mean(axis=(1, 3))
 
 
-def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 3) of a mesh (V, 3), (F, 3), weighted by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)

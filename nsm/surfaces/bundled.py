@@ -52,7 +52,7 @@ def brain() -> Mesh:
 
 def pyvista_example(name: str) -> Mesh:
     """One of the PLY files among pyvista's examples, as it is there."""
-    vertices, faces, _ = load_mesh(_package_file("pyvista", [f"examples/{name}.ply"], "view"))
+    vertices, faces, _ = load_mesh(_package_file("pyvista", [f"examples/{name}.ply"], "pyvista"))
     return vertices, faces
 
 

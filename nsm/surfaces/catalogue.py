@@ -93,7 +93,7 @@ _REMOTE = {
 _LOCAL: dict[str, tuple[Callable[[], shapes.Mesh], str]] = {
     "terrain": (bundled.terrain, "Jacksboro fault elevation model, 15525 vertices, in metres"),
     "brain": (bundled.brain, "fsaverage5 left pial surface, 10242 vertices (nsm[brain])"),
-    "nut": (partial(bundled.pyvista_example, "nut"), "pyvista's hexagonal nut (nsm[view])"),
+    "nut": (partial(bundled.pyvista_example, "nut"), "pyvista's hexagonal nut (nsm[pyvista])"),
     "plane": (shapes.plane, "square [-1,1]^2, flat, 2025 vertices"),
     "hemisphere": (shapes.hemisphere, "upper half of the unit sphere, 1801 vertices"),
     "sphere": (shapes.sphere, "unit sphere, subdivided icosahedron, 2562 vertices"),

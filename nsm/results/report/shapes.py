@@ -12,9 +12,8 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
 from nsm.results.collection import load_collection
-from nsm.results.map_metrics import triangle_metric
 from nsm.results.metrics import vertex_error
-from nsm.results.pair_metrics import ENERGIES
+from nsm.results.pair_metrics import ENERGIES, triangle_energies
 from nsm.results.parameterization import load_parameterization
 from nsm.results.render import view_frame
 from nsm.results.surface_map import SurfaceMap, load_surface_map
@@ -140,9 +139,8 @@ def _both_ends(
 
 
 def _measured(source: np.ndarray, image: np.ndarray, faces: np.ndarray) -> Distortion:
-    a, b = triangle_metric(source, faces), triangle_metric(image, faces)
-    values = [energy(a, b).numpy() for energy in ENERGIES]
-    return Distortion(dict(zip(_NAMES, values, strict=True)), face_areas(source, faces))
+    energies = triangle_energies(source, image, faces)
+    return Distortion(dict(zip(_NAMES, energies.values(), strict=True)), face_areas(source, faces))
 
 
 def _face_angles(vertices: np.ndarray, reference: np.ndarray, faces: np.ndarray) -> np.ndarray:

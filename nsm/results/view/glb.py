@@ -1,0 +1,46 @@
+"""Shapes as GLB, as the browser draws them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from nsm.results.textures import checkerboard
+from nsm.results.view.scene import Paint, Shape
+
+
+def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
+    """A shape with its vertices at (V, 3), smooth, seen from both sides, in its colours."""
+    colours = np.ones((len(vertices), 4))
+    look: dict[str, Any] = {}
+    coordinates = np.zeros((len(vertices), 2))
+    if paint.colours is not None:
+        colours[:, :3] = _linear(paint.colours)
+    if paint.board is not None:
+        coordinates = 0.5 * (paint.board + 1)
+        look["baseColorTexture"] = checkerboard()
+    visual = trimesh.visual.TextureVisuals(
+        uv=coordinates,
+        material=trimesh.visual.material.PBRMaterial(
+            metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True, **look
+        ),
+    )
+    visual.vertex_attributes["color"] = np.round(255 * colours).astype(np.uint8)
+    mesh = trimesh.Trimesh(
+        vertices,
+        shape.faces,
+        vertex_normals=shape.normals(vertices),
+        visual=visual,
+        process=False,
+    )
+    data = trimesh.Scene(mesh).export(file_type="glb", include_normals=True)
+    assert isinstance(data, bytes)
+    return data
+
+
+def _linear(colours: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] to what glTF has at vertices: linear light."""
+    c = np.clip(colours, 0, 1)
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

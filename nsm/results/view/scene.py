@@ -1,0 +1,304 @@
+"""What the viewer shows of a run: two shapes side by side, and which points of them correspond."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+
+from nsm.results.artifact import NeuralSurface
+from nsm.results.metrics import vertex_error
+from nsm.results.pair_metrics import triangle_energies
+from nsm.results.parameterization import Parameterization
+from nsm.results.pictures import GREY, vertex_means
+from nsm.results.render import vertex_normals, view_frame
+from nsm.results.surface_map import SurfaceMap
+from nsm.surfaces import Surface
+from nsm.surfaces.location import Places, locate
+from nsm.surfaces.topology import edges_of
+
+POSITION, PLAIN = "position on the source", "plain"
+# rotations that bring an axis to y, which a view takes for up
+_Y = np.eye(3)
+UPS = {
+    "y": _Y,
+    "z": _Y[[1, 2, 0]],
+    "x": _Y[[2, 0, 1]],
+    "-y": np.diag([-1.0, -1.0, 1.0]),
+    "-z": np.diag([-1.0, -1.0, 1.0]) @ _Y[[1, 2, 0]],
+    "-x": np.diag([-1.0, -1.0, 1.0]) @ _Y[[2, 0, 1]],
+}
+_GAP = 0.2  # between the shapes, of the wider one
+_FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; of others, percentiles
+_LARGEST = 1e3
+_FIELD_OF_VIEW = np.radians(18)  # narrow: both shapes are seen from one side
+_ASPECT, _ASIDE = 1.5, 0.26  # of a browser's window; the panel is at its right
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A mesh to look at and to pick on.
+
+    Attributes:
+        name: what stands above it.
+        vertices: (V, 3) as it is shown, around the origin.
+        faces: (F, 3).
+        uv: (V, 2) coordinates in its own domain.
+        own: (V, 3) or (V, 2), the vertices as they are told: in the units of the mesh file, or the
+            new coordinates of a flattening.
+        twins: (T, 2) vertices that were one before the mesh was cut.
+        landmarks: (L,) vertices.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    own: np.ndarray
+    twins: np.ndarray
+    landmarks: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @cached_property
+    def _uncut(self) -> np.ndarray:
+        """Of each vertex (V,) the first of those that were one with it."""
+        first = np.arange(len(self.vertices))
+        first[self.twins[:, 1]] = self.twins[:, 0]
+        return first
+
+    @cached_property
+    def seam(self) -> np.ndarray:
+        """The edges (E, 2) along which the mesh was cut, each once."""
+        edges = edges_of(self.faces)
+        rim = edges.pairs[edges.count == 1]
+        before = np.sort(self._uncut[rim], axis=1)
+        _, first, count = np.unique(before, axis=0, return_index=True, return_counts=True)
+        return rim[first[count > 1]]
+
+    def normals(self, vertices: np.ndarray) -> np.ndarray:
+        """Unit normals (V, 3) where its vertices are at (V, 3); the seam is smooth."""
+        total = np.zeros((len(vertices), 3))
+        np.add.at(total, self._uncut, vertex_normals(vertices, self.faces))
+        total = total[self._uncut]
+        return total / np.maximum(np.linalg.norm(total, axis=1), 1e-30)[:, None]
+
+
+class Scale(NamedTuple):
+    """Of colours that stand for numbers: the ends, and whether it is logarithmic."""
+
+    low: float
+    high: float
+    log: bool
+
+    def colours(self, values: np.ndarray) -> np.ndarray:
+        """Colours (N, 3) in [0, 1] of numbers (N,)."""
+        norm = (LogNorm if self.log else Normalize)(self.low, self.high)
+        return ScalarMappable(norm, "viridis").to_rgba(values)[:, :3]
+
+    def bar(self, count: int) -> np.ndarray:
+        """The colours (count, 3) from end to end."""
+        ends = np.geomspace if self.log else np.linspace
+        return self.colours(ends(self.low, self.high, count))
+
+
+class Paint(NamedTuple):
+    """Colours of a shape: at its vertices (V, 3) in [0, 1], or a checkerboard at (V, 2)."""
+
+    colours: np.ndarray | None
+    board: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A source and a target, and the map between them.
+
+    Attributes:
+        source, target: the two shapes.
+        image_uv: (V, 2) where the source's vertices go, in the target's domain. The map is linear
+            on each triangle of the source.
+        image: (V, 3) where they go on the target, as it is shown.
+        frame: rows right, up and towards the viewer (3, 3).
+        boards: name to coordinates (V, 2) of the source in [-1, 1]², for checkerboards.
+        energies: name to numbers (F,) on the source's triangles.
+        errors: name to numbers (V,) at its vertices.
+    """
+
+    source: Shape
+    target: Shape
+    image_uv: np.ndarray
+    image: np.ndarray
+    frame: np.ndarray
+    boards: dict[str, np.ndarray]
+    energies: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def shapes(self) -> tuple[Shape, Shape]:
+        return self.source, self.target
+
+    @property
+    def colourings(self) -> list[str]:
+        """The names that :meth:`paint` knows."""
+        return [*self.boards, *self.errors, *self.energies, POSITION, PLAIN]
+
+    @cached_property
+    def _back(self) -> Places:
+        return locate(self.target.uv, self.image_uv, self.source.faces)
+
+    def carried(self, values: np.ndarray) -> np.ndarray:
+        """Values (V, ...) at the source's vertices, at those of the target (W, ...)."""
+        return self._back.take(values, self.source.faces)
+
+    def across(self, side: int, places: Places) -> Places:
+        """Places on one shape (0: the source) to those on the other that correspond to them."""
+        if side == 0:
+            uv = places.take(self.image_uv, self.source.faces)
+            return locate(uv, self.target.uv, self.target.faces)
+        uv = places.take(self.target.uv, self.target.faces)
+        return locate(uv, self.image_uv, self.source.faces)
+
+    def morph(self, t: float) -> np.ndarray:
+        """The source's vertices (V, 3) on the straight way to their images."""
+        return (1 - t) * self.source.vertices + t * self.image
+
+    def paint(self, name: str) -> tuple[Paint, Paint]:
+        """The colours of both shapes; a point and its image have the same."""
+        if name in self.boards:
+            board = self.boards[name]
+            return Paint(None, board), Paint(None, self.carried(board))
+        vertices = self.source.vertices
+        scale = self.scale(name)
+        if scale is not None:
+            values = self._at_vertices(name)
+            of_target = self.carried(values)
+            return Paint(scale.colours(values), None), Paint(scale.colours(of_target), None)
+        colours = np.tile(GREY, (len(vertices), 1))
+        if name == POSITION:
+            extent = np.maximum(np.ptp(vertices, axis=0), 1e-12)
+            colours = (vertices - vertices.min(axis=0)) / extent
+        return Paint(colours, None), Paint(self.carried(colours), None)
+
+    def scale(self, name: str) -> Scale | None:
+        """What the colours of numbers stand for; None of other colourings."""
+        if name not in self.energies and name not in self.errors:
+            return None
+        if name in _FIXED:
+            return Scale(*_FIXED[name], log=True)
+        values = self.errors.get(name, self.energies.get(name, np.zeros(0)))
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, [1, 98]) if len(known) else (0.0, 0.0)
+        return Scale(float(low), float(max(high, low + 1e-9)), log=False)
+
+    def _at_vertices(self, name: str) -> np.ndarray:
+        if name in self.errors:
+            return self.errors[name]
+        # one triangle without any area would outshine all around it
+        bounded = np.minimum(np.nan_to_num(self.energies[name], nan=np.inf), _LARGEST)
+        return vertex_means(bounded, self.source.faces, len(self.source.vertices))
+
+    @cached_property
+    def offsets(self) -> np.ndarray:
+        """(2, 3) where the shapes' origins are put, so that they stand side by side."""
+        half = self._half[:, 0]
+        gap = _GAP * half.max()
+        right = self.frame[0]
+        return np.stack([-(half[1] + gap) * right, (half[0] + gap) * right])
+
+    @cached_property
+    def _half(self) -> np.ndarray:
+        """Half of each shape's width, height and depth in the view (2, 3)."""
+        return np.stack([np.abs(s.vertices @ self.frame.T).max(axis=0) for s in self.shapes])
+
+    @property
+    def camera(self) -> tuple[np.ndarray, np.ndarray]:
+        """From where, and to where (3,), a camera with :attr:`field_of_view` sees both shapes."""
+        width = self._half[:, 0].sum() + _GAP * self._half[:, 0].max()
+        height, depth = self._half[:, 1:].max(axis=0)
+        tangent = np.tan(0.5 * self.field_of_view)
+        distance = 1.1 * max(width / (_ASPECT * tangent), height / tangent) + depth
+        aim = _ASIDE * width * self.frame[0]
+        return aim + distance * self.frame[2], aim
+
+    field_of_view = float(_FIELD_OF_VIEW)
+
+
+def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y") -> Scene:
+    """A mesh beside its neural surface or its flattening, or the two surfaces of a map.
+
+    The axis ``up`` (of :data:`UPS`) of the mesh file, of a map's source, is shown upright.
+    """
+    mesh = result.source if isinstance(result, SurfaceMap) else result
+    mesh = mesh.phi if isinstance(mesh, Parameterization) else mesh
+    turn = UPS[up]
+    frame = view_frame(mesh.surface.vertices @ turn.T) @ turn
+    if isinstance(result, SurfaceMap):
+        return _pair(result, frame)
+    if isinstance(result, Parameterization):
+        return _flat(result, frame)
+    return _overfit(result, frame)
+
+
+def _overfit(neural: NeuralSurface, frame: np.ndarray) -> Scene:
+    s = neural.surface
+    image = neural(s.uv)
+    errors = {"distance, % of diagonal": vertex_error(s, neural.map)}
+    centre = _centre(s.vertices, frame)
+    source = _file_shape(f"{s.name}: mesh", neural, s.vertices - centre, s.vertices)
+    target = _file_shape(f"{s.name}: neural surface", neural, image - centre, image)
+    boards = {"checkerboard of the domain": s.uv}
+    energies = _energies(s, image)
+    return Scene(source, target, s.uv, target.vertices, frame, boards, energies, errors)
+
+
+def _flat(result: Parameterization, frame: np.ndarray) -> Scene:
+    s, uv = result.phi.surface, result.uv
+    middle = 0.5 * (uv.min(axis=0) + uv.max(axis=0))
+    # turned to the viewer, whichever way the surface is looked at
+    flat = (uv - middle) @ frame[:2]
+    source = _file_shape(s.name, result.phi, s.vertices - _centre(s.vertices, frame), s.vertices)
+    target = Shape(f"{s.name}: flattened", flat, s.faces, s.uv, uv, s.twins)
+    boards = {
+        "checkerboard of the plane": 2 * (uv - middle) / np.ptp(uv, axis=0).max(),
+        "checkerboard of the domain": s.uv,
+    }
+    return Scene(source, target, s.uv, flat, frame, boards, _energies(s, uv))
+
+
+def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
+    s, t = f.source.surface, f.target.surface
+    turned = f.aligned(t.vertices)
+    centre = _centre(turned, frame)
+    start = s.vertices - _centre(s.vertices, frame)
+    source = _file_shape(s.name, f.source, start, s.vertices, f.landmarks[:, 0])
+    target = _file_shape(t.name, f.target, turned - centre, t.vertices, f.landmarks[:, 1])
+    boards = {"checkerboard of the source": s.uv, "checkerboard of the target": f.image_uv}
+    image = f.aligned_image - centre
+    return Scene(source, target, f.image_uv, image, frame, boards, _energies(s, f.image))
+
+
+def _file_shape(
+    name: str,
+    neural: NeuralSurface,
+    shown: np.ndarray,
+    vertices: np.ndarray,
+    landmarks: np.ndarray | None = None,
+) -> Shape:
+    s = neural.surface
+    ids = () if landmarks is None else landmarks
+    rows = [int(np.flatnonzero(s.source_vertex == vertex)[0]) for vertex in ids]
+    own = neural.in_original_units(vertices)
+    return Shape(name, shown, s.faces, s.uv, own, s.twins, np.array(rows, dtype=np.int64))
+
+
+def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:
+    energies = triangle_energies(surface.vertices, image, surface.faces)
+    return {name.replace("_", " "): value for name, value in energies.items()}
+
+
+def _centre(vertices: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """The middle (3,) of a shape as it is seen."""
+    seen = vertices @ frame.T
+    return 0.5 * (seen.min(axis=0) + seen.max(axis=0)) @ frame
