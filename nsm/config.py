@@ -87,6 +87,7 @@ class TrainerSchema:
     gradient_clip: float | None = MISSING
     progress: bool = MISSING
     precision: str = "float32"
+    compile: bool = False
 
 
 @dataclass

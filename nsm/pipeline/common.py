@@ -28,6 +28,7 @@ from nsm.results.loggers import build_loggers, close, log_figures
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
 from nsm.surfaces import Surface
+from nsm.tasks.compiling import Compiled
 
 CONFIG_FILE = "config.yaml"
 CHECKPOINT_FILE = "last.ckpt"
@@ -140,6 +141,8 @@ def fitted(
     if config.logger.kinds:
         callbacks += [LearningRateMonitor(), Throughput(config.logger.every), pictures]
     module.log_every = config.logger.every
+    if settings.compile:
+        module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))
     quiet_lightning()
     accelerator = settings.accelerator
     if accelerator == "auto":  # Lightning would choose Apple's GPU, which has no float64

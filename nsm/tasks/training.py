@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
+from nsm.tasks.compiling import Compiled
 from nsm.tasks.splitting import Splitting
 from nsm.tasks.terms import Term
 
@@ -16,9 +17,19 @@ class Training(Splitting):
     Attributes:
         log_every: steps between two values that the logger takes; in the steps between, Lightning
             would spend as long on figures as the network on its work.
+        compiled: calls evaluations of a training step in a compiled form; None: as they are.
     """
 
     log_every = 1
+    compiled: Compiled | None = None
+
+    def pointwise(
+        self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
+    ) -> tuple[Tensor, ...]:
+        # held-out batches have other shapes, and parts of a batch are checkpointed
+        if self.compiled is not None and self.training and self.parts == 1:
+            return self.compiled(function, x)
+        return super().pointwise(function, x)
 
     def note(self, figures: dict[str, Tensor]) -> None:
         """Log figures of a training step as ``train/NAME``, in the steps that the logger takes."""
