@@ -4,7 +4,7 @@ Sides that are compared run in turn, round by round, and medians are taken. On a
 time of the process (its threads together), so that other programs disturb little; on a GPU it is
 the clock, synchronised. The GPU is used where there is one.
 
-    python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N]
+    python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N] [--meshes FOLDER]
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+import nsm
 from nsm.config import compose_config
 from nsm.data import OverfitData, Samples
-from nsm.energies.overfit import position
-from nsm.maps import NeuralMap, build_map
+from nsm.energies.overfit import normal, position
+from nsm.maps import NeuralMap, build_map, together
 from nsm.pipeline import build_overfit
 from nsm.pipeline.collection_map import build_collection_map
 from nsm.pipeline.pair_map import build_pair_map
@@ -37,6 +38,7 @@ from nsm.results import NeuralSurface, atomic_write
 from nsm.surfaces import Surface
 from nsm.surfaces.shapes import ring_mesh
 from nsm.surfaces.together import matched_landmarks
+from nsm.tasks.compiling import Compiled
 from nsm.tasks.weakest import Weakest
 
 RESULTS = Path(__file__).parent / "results"
@@ -46,6 +48,9 @@ SETTINGS = ("paper", "default")
 ERRORS = (1.0, 0.5, 0.2, 0.1)  # RMS in percent of the diagonal
 SHARES = (0.5, 0.8, 0.9, 0.95)  # of the way from the domain's distortion to the least one found
 SURFACES = 3
+TOGETHER = (2, 4, 16)  # surfaces in one batch
+LENGTHS = (500, 1000, 2000, 4000, 8000)  # steps of a training that shall reach GOAL
+GOAL = 0.1  # RMS in percent of the diagonal
 NEVER = 10**12  # steps
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -411,6 +416,84 @@ def _kept(step: Step) -> float:
     return sum(storages.values()) / 2**20
 
 
+def batches(rounds: int) -> dict[str, Any]:
+    """Milliseconds of a step of several surfaces, one after the other and in one batch, and of
+    one surface in compiled form."""
+    config, surface = config_of("overfit", "default"), dome()
+    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+    data.trainer = None
+    data.setup()
+    batch = data.batch(0)
+    modules = [build_overfit(config, surface).to(DEVICE) for _ in range(max(TOGETHER))]
+
+    def step(one: Callable[[Tensor], tuple[Tensor, Tensor]], uv: Tensor) -> Step:
+        def run() -> None:
+            value, jacobian = one(uv)
+            loss = position(value, batch.points.expand_as(value)).mean()
+            turn = normal(jacobian, batch.normals.expand_as(value)).mean()
+            (loss + config.energy.lambda_normal * turn).backward()
+
+        return run
+
+    found: dict[str, Any] = {}
+    for k in TOGETHER:
+        nets = [m.map for m in modules[:k]]
+        singly = [step(net.value_and_jacobian, batch.uv) for net in nets]
+
+        def one_by_one(steps: list[Step] = singly) -> None:
+            for one in steps:
+                one()
+
+        at_once = step(together(nets).value_and_jacobian, batch.uv.expand(k, -1, -1))
+        taken = in_turn({"one_by_one": one_by_one, "together": at_once}, rounds)
+        found[str(k)] = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
+        found[str(k)]["ratio"] = taken["one_by_one"] / taken["together"]
+    net = modules[0].map
+    compiled, told = Compiled(print), "compiled" if DEVICE.type == "cpu" else "recorded"
+    sides = {
+        "as_it_is": step(net.value_and_jacobian, batch.uv),
+        told: step(lambda uv: compiled(net.value_and_jacobian, uv), batch.uv),  # type: ignore[arg-type,return-value]
+    }
+    taken = in_turn(sides, 10 * rounds)
+    found["compiled"] = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
+    found["compiled"]["ratio"] = taken["as_it_is"] / taken[told]
+    print(json.dumps(found, indent=1), flush=True)
+    return found
+
+
+def goals(meshes: Path) -> dict[str, Any]:
+    """Seconds by the clock, all in all, of what a user waits for: the bunny as a network of GOAL
+    RMS error, and a map of two animals whose networks are there."""
+    found: dict[str, Any] = {"goal_percent": GOAL}
+    bunny = Surface.load(str(meshes / "stanford-bunny.obj"))
+    marks = [str(meshes / "landmarks" / f"shrec07-{k}.vts") for k in (384, 388)]
+    animals = [str(meshes / f"shrec07-{k}.off") for k in (384, 388)]
+    ready = nsm.map_pair(*animals, marks, overrides=["trainer.max_steps=1"], progress=False)
+    for compiled in (False, True):
+        words = [f"trainer.compile={str(compiled).lower()}"]
+        runs = []
+        for steps in LENGTHS:
+            start = time.perf_counter()
+            length = [*words, f"trainer.max_steps={steps}"]
+            phi = nsm.overfit(bunny, overrides=length, progress=False)
+            seconds, rms = time.perf_counter() - start, phi.metrics["rms_percent"]
+            runs.append({"steps": steps, "seconds": seconds, "rms_percent": rms})
+            if rms <= GOAL:
+                break
+        start = time.perf_counter()
+        f = nsm.map_pair(
+            ready.source, ready.target, ready.landmarks.tolist(), overrides=words, progress=False
+        )
+        seconds = time.perf_counter() - start
+        kept = ("symmetric_dirichlet_median", "flipped_percent", "landmark_error_max_percent")
+        found["compiled" if compiled else "as_it_is"] = {
+            "bunny": runs,
+            "pair_map": {"seconds": seconds, **{key: f.metrics[key] for key in kept}},
+        }
+        print(json.dumps(found, indent=1), flush=True)
+    return found
+
+
 def page(results: dict[str, Any]) -> str:
     """The results as a page of the documentation."""
     on = results["machine"]
@@ -498,6 +581,46 @@ def page(results: dict[str, Any]) -> str:
             "mesh": "triangles: samples and the watch on folds",
         }
         lines += [f"| {names[k]} | {', '.join(v)} |" for k, v in groups.items()]
+    if "batches" in results:
+        b = results["batches"]
+        lines += [
+            "",
+            "## Several surfaces in one batch",
+            "",
+            "Loss and gradient of overfitting with the default settings.",
+            "",
+            "| surfaces | one by one, ms | together, ms | times as fast |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {k} | {b[str(k)]['one_by_one_milliseconds']:.1f} | "
+            f"{b[str(k)]['together_milliseconds']:.1f} | {b[str(k)]['ratio']:.2f} |"
+            for k in TOGETHER
+        ]
+        lines += [
+            "",
+            "In compiled form (`trainer.compile=true`) a step is "
+            f"{b['compiled']['ratio']:.2f} times as fast.",
+        ]
+    if "goals" in results:
+        g = results["goals"]
+        lines += [
+            "",
+            "## What a user waits for",
+            "",
+            f"By the clock: the bunny until its RMS error is {g['goal_percent']} % of the "
+            "diagonal, by trainings of growing length; a map of two animals from their networks.",
+            "",
+            "| evaluation | bunny: steps, RMS, seconds | map: median distortion, flips, seconds |",
+            "|---|---|---|",
+        ]
+        lines += [
+            f"| {name.replace('_', ' ')} | {last['steps']}, {last['rms_percent']:.3f} %, "
+            f"{last['seconds']:.0f} | {pair['symmetric_dirichlet_median']:.3f}, "
+            f"{pair['flipped_percent']:.3f} %, {pair['seconds']:.0f} |"
+            for name in ("as_it_is", "compiled")
+            for last, pair in [(g[name]["bunny"][-1], g[name]["pair_map"])]
+        ]
     if "memory" in results:
         lines += [
             "",
@@ -515,7 +638,7 @@ def page(results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-PARTS = ("costs", "peak", "growth", "memory", "times")
+PARTS = ("costs", "peak", "growth", "batches", "memory", "times", "goals")
 
 
 def main() -> None:
@@ -524,9 +647,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0, help="limit of one training")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
+    parser.add_argument("--meshes", type=Path, help="folder of bunny and animals: adds the goals")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, help="all by default")
     parser.add_argument("--output", type=Path, help="folder of the JSON; also no page is written")
     arguments = parser.parse_args()
+    parts = arguments.parts or [p for p in PARTS if p != "goals" or arguments.meshes]
+    if "goals" in parts and not (arguments.meshes and arguments.meshes.is_dir()):
+        parser.error("goals need the folder of the meshes; give it with --meshes")
     torch.set_num_threads(arguments.threads)
     cuda = DEVICE.type == "cuda"
     device = torch.cuda.get_device_name() if cuda else f"{os.cpu_count()} CPU cores"
@@ -543,10 +670,12 @@ def main() -> None:
         "costs": lambda: costs(arguments.rounds),
         "peak": lambda: share_of_peak(arguments.rounds),
         "growth": lambda: growth(arguments.rounds),
+        "batches": lambda: batches(arguments.rounds),
         "memory": memory,
         "times": lambda: times(arguments.mesh, arguments.seconds),
+        "goals": lambda: goals(arguments.meshes),
     }
-    for part in arguments.parts:  # kept one by one: a long run that is stopped has its parts
+    for part in parts:  # kept one by one: a long run that is stopped has its parts
         found = make[part]()
         results = json.loads(output.read_text()) if output.exists() else {}
         results = {**results, "machine": machine, part: found}

@@ -144,9 +144,7 @@ def fitted(
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))
     quiet_lightning()
-    accelerator = settings.accelerator
-    if accelerator == "auto":  # Lightning would choose Apple's GPU, which has no float64
-        accelerator = "gpu" if torch.cuda.is_available() else "cpu"
+    accelerator = accelerator_of(config)
     try:
         trainer = pl.Trainer(
             accelerator=accelerator,
@@ -191,6 +189,14 @@ def fitted(
         console.print(f"interrupted; go on with: nsm resume={folder}", soft_wrap=True)
         raise KeyboardInterrupt
     return trainer
+
+
+def accelerator_of(config: DictConfig) -> str:
+    """The hardware that a training runs on, ``gpu`` or ``cpu``."""
+    chosen: str = config.trainer.accelerator
+    if chosen == "auto":  # Lightning would choose Apple's GPU, which has no float64
+        return "gpu" if torch.cuda.is_available() else "cpu"
+    return chosen
 
 
 def quiet_lightning() -> None:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
-from nsm.pipeline.common import report_surface
+from nsm.pipeline.common import accelerator_of, report_surface
 from nsm.pipeline.neural import made_together
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.surfaces import Surface
@@ -148,7 +148,9 @@ def neural_surfaces(
         prepared = _prepare(config, meshes, landmarks)
         for surface in prepared:
             report_surface(console, surface)
-        made = made_together(prepared, config, console)
+        made = made_together(
+            prepared, config, console, in_one_batch=accelerator_of(config) == "gpu"
+        )
         for (k, _), phi in zip(meshes, made, strict=True):
             result[k] = phi
     return [r for r in result if r is not None]

@@ -93,9 +93,16 @@ def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralS
 
 
 def made_together(
-    surfaces: Sequence[Surface], config: DictConfig, console: Console
+    surfaces: Sequence[Surface], config: DictConfig, console: Console, *, in_one_batch: bool
 ) -> list[NeuralSurface]:
-    """As :func:`made_once` of each; those that are not in the cache are trained in one batch.
+    """As :func:`made_once` of each.
+
+    Args:
+        surfaces: prepared ones.
+        config: of the map that wants them.
+        console: told what is done.
+        in_one_batch: train those that are not in the cache together, which fills a GPU; a CPU is
+            as fast with one after the other, and keeps more if it is interrupted.
 
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
@@ -110,7 +117,7 @@ def made_together(
     # these look at a whole training's gradient, where each surface needs its own; and what was
     # begun alone goes on alone
     begun = any((folder / CHECKPOINT_FILE).exists() for folder in missing)
-    if len(missing) > 1 and limits == (None, None) and not begun:
+    if in_one_batch and len(missing) > 1 and limits == (None, None) and not begun:
         _fill_cache(missing, overfit, console)
     return [made_once(surface, config, console) for surface in surfaces]
 
@@ -180,7 +187,8 @@ def _settings_of_phi(config: DictConfig) -> DictConfig:
 def _place_of(surface: Surface, overfit: DictConfig) -> Path:
     """Where the cache has, or will have, the neural surface of a prepared one."""
     settings = {k: v for k, v in plain(overfit).items() if k not in _INCIDENTAL}
-    settings["trainer"].pop("progress")
+    for key in ("progress", "compile"):
+        settings["trainer"].pop(key)
     text = surface.content_key() + json.dumps(settings, sort_keys=True)
     folder = cache_folder() / "neural" / hashlib.sha256(text.encode()).hexdigest()[:32]
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,7 @@ def made(surfaces, words: list[str], *, together: bool) -> tuple[list[nsm.Neural
     told = io.StringIO()
     console = Console(file=told)
     if together:
-        return made_together(surfaces, config, console), told.getvalue()
+        return made_together(surfaces, config, console, in_one_batch=True), told.getvalue()
     return [made_once(surface, config, console) for surface in surfaces], told.getvalue()
 
 
