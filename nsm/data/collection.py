@@ -65,10 +65,7 @@ class CollectionData(pl.LightningDataModule):
         return torch.cat(parts)
 
     def train_dataloader(self) -> DataLoader[Tensor]:
-        trainer = self.trainer
-        assert trainer is not None
-        steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
-        return DataLoader(steps, batch_size=None)
+        return Steps.following(self.trainer, self.batch, self.steps_per_epoch)
 
     def val_dataloader(self) -> DataLoader[Tensor]:
         points = self._drawn(self.held_share, 0.0, HELD_OUT_SEED, 0)

@@ -24,6 +24,14 @@ class Steps(IterableDataset[Any]):
     ) -> None:
         self.draw, self.first_step, self.length = draw, first_step, length
 
+    @classmethod
+    def following(
+        cls, trainer: pl.Trainer | None, draw: Callable[[int], Any], length: int
+    ) -> DataLoader[Any]:
+        """The next ``length`` batches of a trainer, wherever it stands when they are wanted."""
+        assert trainer is not None
+        return DataLoader(cls(draw, lambda: trainer.global_step, length), batch_size=None)
+
     def __len__(self) -> int:
         return self.length
 
@@ -87,10 +95,7 @@ class OverfitData(pl.LightningDataModule):
         return Samples(*(part[index] for part in self.pool))
 
     def train_dataloader(self) -> DataLoader[Samples]:
-        trainer = self.trainer
-        assert trainer is not None
-        steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
-        return DataLoader(steps, batch_size=None)
+        return Steps.following(self.trainer, self.batch, self.steps_per_epoch)
 
     def held_out_batches(self) -> list[Samples]:
         """The held-out samples, so many at once as are evaluated together."""
@@ -127,10 +132,7 @@ class SeveralData(pl.LightningDataModule):
         return _stacked([part.batch(step) for part in self.parts])
 
     def train_dataloader(self) -> DataLoader[Samples]:
-        trainer = self.trainer
-        assert trainer is not None
-        steps = Steps(self.batch, lambda: trainer.global_step, self.steps_per_epoch)
-        return DataLoader(steps, batch_size=None)
+        return Steps.following(self.trainer, self.batch, self.steps_per_epoch)
 
     def val_dataloader(self) -> DataLoader[Samples]:
         each = zip(*(part.held_out_batches() for part in self.parts), strict=True)
