@@ -81,6 +81,7 @@ class DataSchema:
 class TrainerSchema:
     max_steps: int = MISSING
     accelerator: str = MISSING
+    devices: int = 1
     stop_gradient_norm: float | None = MISSING
     stop_window: int = MISSING
     threads: int | None = MISSING
@@ -136,6 +137,7 @@ _POSITIVE = (
     "data.steps_per_epoch",
     "data.held_out",
     "trainer.max_steps",
+    "trainer.devices",
     "trainer.stop_window",
     "logger.every",
 )

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from nsm.data.overfit import HELD_OUT_SEED, Steps
+from nsm.data.parts import Part
 from nsm.data.sampling import SurfaceSampler
 from nsm.surfaces import Surface
 
@@ -45,15 +46,17 @@ class CollectionData(pl.LightningDataModule):
         self.share = max(1, batch_size // len(surfaces))
         self.held_share = max(1, held_out // len(surfaces))
         self.steps_per_epoch, self.vertex_share, self.seed = steps_per_epoch, vertex_share, seed
+        self.part = Part()
 
     def setup(self, stage: str | None = None) -> None:
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        self.part = Part.of(self.trainer)
         self.samplers = [SurfaceSampler(surface, device) for surface in self.surfaces]
         self.turns = self.turns.to(device)
 
     def batch(self, step: int) -> Tensor:
-        """The training samples (N, 2) of a step."""
-        return self._drawn(self.share, self.vertex_share, self.seed, step)
+        """The training samples (N, 2) of a step; of several processes, this one's part of them."""
+        return self.part.of_rows(self._drawn(self.share, self.vertex_share, self.seed, step))
 
     def _drawn(self, count: int, vertex_share: float, seed: int, step: int) -> Tensor:
         # one stream for all: the samples of the surfaces are independent

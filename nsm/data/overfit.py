@@ -9,6 +9,7 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader, IterableDataset
 
+from nsm.data.parts import Part
 from nsm.data.sampling import Samples, SurfaceSampler
 from nsm.surfaces import Surface
 
@@ -71,9 +72,11 @@ class OverfitData(pl.LightningDataModule):
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.vertex_share, self.pool_size = vertex_share, pool
         self.held_out, self.seed = held_out, seed
+        self.part = Part()
 
     def setup(self, stage: str | None = None) -> None:
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        self.part = Part.of(self.trainer)
         self.sampler = SurfaceSampler(self.surface, device)
         self.pool = (
             self.sampler.pool(self.pool_size, self.sampler.generator(self.seed, -1))
@@ -82,7 +85,10 @@ class OverfitData(pl.LightningDataModule):
         )
 
     def batch(self, step: int) -> Samples:
-        """The training samples of a step."""
+        """The training samples of a step; of several processes, this one's part of them."""
+        return Samples(*(self.part.of_rows(rows) for rows in self._whole(step)))
+
+    def _whole(self, step: int) -> Samples:
         generator = self.sampler.generator(self.seed, step)
         if self.pool is None:
             return self.sampler.draw(self.batch_size, self.vertex_share, generator)

@@ -14,12 +14,16 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.accelerators import CUDAAccelerator
 from pytorch_lightning.callbacks import Callback, LearningRateMonitor
+from pytorch_lightning.loggers import Logger
 from rich.console import Console
+from torch.multiprocessing.spawn import ProcessRaisedException
 
 from nsm.config import PRECISIONS
 from nsm.data import OverfitData
 from nsm.errors import NsmError
+from nsm.pipeline.processes import Process, shared_steps, take_over, told_by
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
 from nsm.results.faults import Faults, faults_of
@@ -145,10 +149,13 @@ def fitted(
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))
     quiet_lightning()
     accelerator = accelerator_of(config)
+    several = settings.devices > 1
     try:
         trainer = pl.Trainer(
             accelerator=accelerator,
-            devices=1,
+            devices=settings.devices,
+            strategy=shared_steps() if several else "auto",
+            use_distributed_sampler=False,
             max_steps=settings.max_steps,
             max_epochs=-1,
             gradient_clip_val=settings.gradient_clip,
@@ -162,7 +169,10 @@ def fitted(
         )
     except Exception as error:  # Lightning's own exceptions for hardware that is not there
         reason = " ".join(str(error).split())
-        raise NsmError(f"setting trainer.accelerator={accelerator}: {reason}") from error
+        raise NsmError(
+            f"setting trainer.accelerator={accelerator}, trainer.devices={settings.devices}: "
+            f"{reason}"
+        ) from error
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
     # killed before the first checkpoint, a run starts again from its beginning
@@ -172,11 +182,20 @@ def fitted(
         checkpoint = None
     logged = plain(config)["logger"]
     kinds, places = logged["kinds"], {key: logged[key] for key in ("project", "uri", "every")}
-    trainer.loggers = build_loggers(kinds, folder, plain(config), first_step=first_step, **places)
+
+    def loggers(step: int) -> list[Logger]:
+        return build_loggers(kinds, folder, plain(config), first_step=step, **places)
+
+    if several:
+        trainer.callbacks.insert(0, Process(console, lambda: loggers(first_step)))  # type: ignore[attr-defined]
+    else:
+        trainer.loggers = loggers(first_step)
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(PRECISIONS[settings.precision])
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except ProcessRaisedException as error:
+        raise told_by(error) from error
     except SystemExit:  # what Lightning makes of an interrupt
         if not trainer.interrupted:
             raise
@@ -188,6 +207,9 @@ def fitted(
     if trainer.interrupted:
         console.print(f"interrupted; go on with: nsm resume={folder}", soft_wrap=True)
         raise KeyboardInterrupt
+    if several:
+        take_over(trainer, data, folder / CHECKPOINT_FILE)
+        trainer.loggers = loggers(trainer.global_step + 1)
     return trainer
 
 
@@ -195,14 +217,16 @@ def accelerator_of(config: DictConfig) -> str:
     """The hardware that a training runs on, ``gpu`` or ``cpu``."""
     chosen: str = config.trainer.accelerator
     if chosen == "auto":  # Lightning would choose Apple's GPU, which has no float64
-        return "gpu" if torch.cuda.is_available() else "cpu"
+        # unlike torch's, its question for a GPU leaves the process fit for a fork
+        return "gpu" if CUDAAccelerator.is_available() else "cpu"
     return chosen
 
 
 def quiet_lightning() -> None:
     """Leave out Lightning's remarks on data loaders and hardware: they do not concern samples that
     are made on the device."""
-    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    for name in ("pytorch_lightning", "lightning_fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="pytorch_lightning")
     warnings.filterwarnings("ignore", module="lightning_fabric")
 

@@ -180,14 +180,17 @@ def _settings_of_phi(config: DictConfig) -> DictConfig:
         f"domain={config.domain}",
         f"seed={config.seed}",
     ]
-    progress = f"trainer.progress={str(config.trainer.progress).lower()}"
-    return compose_config([*words, progress, *config.phi.overrides])
+    words += [
+        f"trainer.progress={str(config.trainer.progress).lower()}",
+        f"trainer.devices={config.trainer.devices}",
+    ]
+    return compose_config([*words, *config.phi.overrides])
 
 
 def _place_of(surface: Surface, overfit: DictConfig) -> Path:
     """Where the cache has, or will have, the neural surface of a prepared one."""
     settings = {k: v for k, v in plain(overfit).items() if k not in _INCIDENTAL}
-    for key in ("progress", "compile"):
+    for key in ("progress", "compile", "devices"):
         settings["trainer"].pop(key)
     text = surface.content_key() + json.dumps(settings, sort_keys=True)
     folder = cache_folder() / "neural" / hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -39,6 +39,8 @@ class AtomicCheckpoint(Callback):
         temporary = self.path.with_suffix(".tmp")
         try:
             trainer.save_checkpoint(temporary)
+            if not trainer.is_global_zero:
+                return
             with temporary.open("rb") as stream:
                 os.fsync(stream.fileno())
             os.replace(temporary, self.path)
@@ -115,6 +117,8 @@ class Pictures(Callback):
         self.name, self.draw, self.count, self.taken = name, draw, count, 0
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
         share = trainer.global_step / max(1, trainer.max_steps)
         due = int(share * self.count)
         if due <= self.taken:

@@ -50,7 +50,8 @@ class Faults(Callback):
     ) -> None:
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients)
-        if bool(torch.isfinite(norm)) and (self.loss is None or bool(torch.isfinite(self.loss))):
+        good = bool(torch.isfinite(norm)) and (self.loss is None or bool(torch.isfinite(self.loss)))
+        if trainer.strategy.reduce_boolean_decision(good):  # all processes do the same
             if self.good is None or trainer.global_step % _EVERY == 0:
                 self._keep(trainer.global_step, pl_module, optimizer)
             return

@@ -34,7 +34,8 @@ class Throughput(Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        self.samples += len(batch[0] if isinstance(batch, tuple) else batch)
+        of_process = len(batch[0] if isinstance(batch, tuple) else batch)
+        self.samples += of_process * trainer.world_size
         due = trainer.global_step % self.every == 0
         if due:
             # a GPU still works at what was asked of it: the value is the time until it is done

@@ -98,6 +98,10 @@ class Splitting(pl.LightningModule):
         except (MemoryError, RuntimeError) as error:
             if not out_of_memory(error):
                 raise
+            if self.trainer.world_size > 1:  # the other processes cannot be asked to try again
+                raise NsmError(
+                    "out of memory in one of several processes; lower data.batch_size or map.width"
+                ) from error
             if evaluated:  # some weights may have moved: trying again would move them twice
                 raise NsmError(
                     "out of memory for the optimiser's own values; lower map.width or "

@@ -28,8 +28,8 @@ class Distortion:
 
     def _mean(self, values: Tensor) -> Tensor:
         if self.share is None:
-            return values.sum() / max(1, values.numel())
-        weight = self.share.sum(dim=-1).clamp(min=1e-12)
+            return values.sum() / mean_of_processes(values.new_tensor(max(1, values.numel())))
+        weight = mean_of_processes(self.share.sum(dim=-1)).clamp(min=1e-12)
         return ((self.share * values).sum(dim=-1) / weight).mean()
 
     @property
@@ -47,6 +47,19 @@ class Distortion:
     def mean(self) -> Tensor:
         """The mean of the blend, zero if there are no samples."""
         return self._mean(self.values)
+
+
+def mean_of_processes(amount: Tensor) -> Tensor:
+    """The mean of what each process of a training has, without a gradient.
+
+    Gradients are averaged over the processes: a sum over a process's samples, divided by this mean
+    of their weights, counts for the mean over all samples.
+    """
+    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+        return amount
+    total = amount.detach().clone()
+    torch.distributed.all_reduce(total)
+    return total / torch.distributed.get_world_size()
 
 
 class HeldOut:
