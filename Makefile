@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-maps bench-activation bench-speed torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-activation bench-speed torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -23,6 +23,10 @@ docs: .venv/.nsm-docs
 # Error against time, default beside paper settings: about an hour. MESHES names the folder.
 bench: .venv/.nsm-dev
 	$(BIN)/python benchmarks/overfit.py $(if $(MESHES),--meshes $(MESHES))
+
+# What makes a training need fewer steps, one change at a time: about a minute for each mesh and trial.
+bench-steps: .venv/.nsm-dev
+	$(BIN)/python benchmarks/steps.py $(if $(MESHES),--meshes $(MESHES))
 
 # Maps between the meshes of the folder MESHES, and flattening beside libigl's: over an hour.
 bench-maps: .venv/.nsm-dev

@@ -14,86 +14,29 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
-from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning.callbacks import Callback
 from rich.console import Console
+from training import MESHES, Clock, surface_of, train
 
 from nsm.config import compose_config
-from nsm.data import OverfitData
-from nsm.pipeline import build_overfit, quiet_lightning
+from nsm.pipeline import quiet_lightning
 from nsm.results import atomic_write, overfit_metrics
 from nsm.results.callbacks import GradientWatch
 from nsm.surfaces import Surface
 
 RESULT = Path(__file__).parent / "results" / "overfit.json"
-MESHES = {
-    "cow": "cow.obj",
-    "bunny": "stanford-bunny.obj",
-    "shrec07-384": "shrec07-384.off",
-    "igea": "igea.ply",
-}
 CALIBRATION_STEPS = 200
-
-
-class _Clock(Callback):
-    """Stop after a budget of CPU time; call back at marks. Time spent there does not count."""
-
-    def __init__(self, marks: list[float], at_mark: Any) -> None:
-        self.marks, self.at_mark = list(marks), at_mark
-        self.budget, self.aside = marks[-1], 0.0
-
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.start = time.process_time()
-
-    def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any
-    ) -> None:
-        spent = time.process_time() - self.start - self.aside
-        while self.marks and spent >= self.marks[0]:
-            before = time.process_time()
-            self.at_mark(pl_module, self.marks.pop(0), trainer.global_step)
-            self.aside += time.process_time() - before
-        trainer.should_stop = trainer.should_stop or not self.marks
-
-
-def _train(
-    config: DictConfig, surface: Surface, callbacks: list[Callback]
-) -> tuple[pl.Trainer, Any, float]:
-    module = build_overfit(config, surface)
-    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=config.seed)
-    with tempfile.TemporaryDirectory() as folder:
-        trainer = pl.Trainer(
-            accelerator="cpu",
-            devices=1,
-            max_steps=config.trainer.max_steps,
-            max_epochs=-1,
-            callbacks=callbacks,
-            logger=False,
-            default_root_dir=folder,
-            limit_val_batches=0,
-            num_sanity_val_steps=0,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            enable_checkpointing=False,
-        )
-        start = time.process_time()
-        trainer.fit(module, datamodule=data)
-    return trainer, module, time.process_time() - start
 
 
 def _default(surface: Surface, minutes: float) -> dict[str, Any]:
     short = compose_config([f"trainer.max_steps={CALIBRATION_STEPS}"])
-    rate = _train(short, surface, [])[2] / CALIBRATION_STEPS
+    rate = train(short, surface, [])[2] / CALIBRATION_STEPS
     steps = max(CALIBRATION_STEPS, int(60 * minutes / rate))
     config = compose_config([f"trainer.max_steps={steps}"])
-    _, module, seconds = _train(config, surface, [])
+    _, module, seconds = train(config, surface, [])
     metrics = overfit_metrics(surface, module.map.eval())
     return {"steps": steps, "cpu_seconds": seconds, "metrics": metrics}
 
@@ -112,8 +55,8 @@ def _paper(surface: Surface, minutes: list[float]) -> dict[float, dict[str, Any]
 
     settings = config.trainer
     watch = GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window)
-    trainer, module, seconds = _train(
-        config, surface, [_Clock([60 * m for m in minutes], at_mark), watch]
+    trainer, module, seconds = train(
+        config, surface, [Clock([60 * m for m in minutes], at_mark), watch]
     )
     for m in minutes:  # the stopping rule came first: this is what the user has at that time
         found.setdefault(
@@ -172,20 +115,21 @@ def main() -> None:
     done = json.loads(arguments.output.read_text())["runs"] if arguments.output.exists() else {}
     console = Console()
 
-    def surface_of(name: str) -> Surface:
-        return Surface.load(arguments.meshes / MESHES[name] if arguments.meshes else name)
-
     if "default" in arguments.settings:
         for minutes in sorted(arguments.minutes):
             for name in arguments.names:
                 key = f"{name}/default/{minutes:g}"
                 if key not in done:
-                    _store(key, _default(surface_of(name), minutes), arguments.output)
+                    _store(
+                        key, _default(surface_of(name, arguments.meshes), minutes), arguments.output
+                    )
                     console.print(key)
     if "paper" in arguments.settings:
         for name in arguments.names:
             if any(f"{name}/paper/{m:g}" not in done for m in arguments.minutes):
-                for m, run in _paper(surface_of(name), sorted(arguments.minutes)).items():
+                for m, run in _paper(
+                    surface_of(name, arguments.meshes), sorted(arguments.minutes)
+                ).items():
                     _store(f"{name}/paper/{m:g}", run, arguments.output)
                 console.print(f"{name}/paper")
     table = _table(arguments.output)

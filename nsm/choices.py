@@ -25,7 +25,7 @@ from nsm.errors import NsmError
 from nsm.maps import build_map
 from nsm.maps.activations import ACTIVATIONS
 from nsm.maps.encodings import ENCODINGS
-from nsm.maps.networks import BLOCKS, INITIALISATIONS
+from nsm.maps.networks import BLOCKS, INITIALISATIONS, READOUTS
 from nsm.results.loggers import LOGGERS, require
 from nsm.surfaces.correspondence import SEAMS
 from nsm.surfaces.parameterization import METHODS
@@ -70,6 +70,8 @@ def check_choices(config: DictConfig) -> None:
         require(kind)
     for group, known in named().items():
         _check_named(group, settings[group], known)
+    if settings["map"]["readout"] == "fitted" and task != "overfit":
+        raise NsmError(f"setting map.readout: task={task} has no surface to fit; take linear")
     choice = TASK_CHOICES[task]
     if choice.constraints:
         held = settings["constraints"] or {}
@@ -150,6 +152,7 @@ _WORDS: dict[str, Iterable[str]] = {
     "domain": DOMAINS,
     "map.block": BLOCKS,
     "map.initialisation": INITIALISATIONS,
+    "map.readout": READOUTS,
     "surface.parameterization": METHODS,
     "seam.path": ("auto", *SEAMS),
     "trainer.accelerator": ACCELERATORS,

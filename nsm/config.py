@@ -66,6 +66,7 @@ class MapSchema:
     depth: int = MISSING
     block: str = MISSING
     initialisation: str = MISSING
+    readout: str = "none"
 
 
 @dataclass

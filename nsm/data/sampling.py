@@ -51,11 +51,29 @@ class SurfaceSampler:
 
     def by_area(self, count: int, generator: torch.Generator) -> Samples:
         """``count`` points, uniform by area of the mesh."""
+        return self._at(*self._places(count, generator))
+
+    def by_area_with_jacobian(
+        self, count: int, generator: torch.Generator
+    ) -> tuple[Samples, Tensor]:
+        """``count`` points, uniform by area, and the Jacobian (N, 3, 2) of f: Ω → mesh there."""
+        face, weights = self._places(count, generator)
+        plane, space = self.uv[self.faces[face]].double(), self.vertices[self.faces[face]].double()
+        sides = torch.stack([plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0]], dim=2)
+        edges = torch.stack([space[:, 1] - space[:, 0], space[:, 2] - space[:, 0]], dim=2)
+        jacobian = torch.linalg.solve_ex(sides, edges, left=False).result
+        return self._at(face, weights), jacobian.to(self.vertices.dtype)
+
+    def _places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Faces (N,) and barycentric weights (N, 3) of points that are uniform by area."""
         dice = torch.rand(count, generator=generator, device=self.device, dtype=torch.float64)
         face = torch.searchsorted(self.cumulative_area, dice).clamp(max=len(self.faces) - 1)
         r = torch.rand(count, 2, generator=generator, device=self.device)
         root = r[:, 0].sqrt()
         weights = torch.stack([1 - root, root * (1 - r[:, 1]), root * r[:, 1]], dim=1)
+        return face, weights
+
+    def _at(self, face: Tensor, weights: Tensor) -> Samples:
         corners = self.faces[face]
         return Samples(
             uv=(weights[:, :, None] * self.uv[corners]).sum(dim=1),

@@ -219,8 +219,9 @@ class SplineGrid(nn.Module):
             raise ValueError("the spline grid takes points of the plane and degree 2 or 3")
         self.resolutions = [int(r) for r in resolutions]
         self.degree, self.extent, self.features = degree, float(extent), features
+        self.sides = [r + degree for r in self.resolutions]  # of the tables
         self.tables = nn.ParameterList(
-            nn.Parameter(1e-2 * torch.randn((r + degree) ** 2, features)) for r in self.resolutions
+            nn.Parameter(1e-2 * torch.randn(side**2, features)) for side in self.sides
         )
         self.out_dim = in_dim + features * len(self.resolutions)
 
@@ -241,6 +242,22 @@ class SplineGrid(nn.Module):
         rows = across[:, :, None] + (corner[:, 1, None] + step)[:, None]
         scaled = [[w * within for w in slopes], [w * within * within for w in bends]]
         return rows.flatten(1, 2), [weights, *scaled]
+
+    def seen(self, x: Tensor, level: int) -> tuple[Tensor, Tensor]:
+        """What points see of a level's table, which its features are linear in.
+
+        Args:
+            x: (N, 2).
+            level: number of the resolution.
+
+        Returns:
+            rows (N, k²) of the table; their weights (3, N, k²) in value and both tangents.
+        """
+        rows, orders = self._seen(x)
+        value, first, _ = (torch.stack(w, dim=2)[level] for w in orders)
+        pairs = ((value, value), (first, value), (value, first))
+        blend = torch.stack([(u[0, :, None] * v[1, None]).flatten(0, 1) for u, v in pairs])
+        return rows[level].t(), blend.transpose(1, 2)
 
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""

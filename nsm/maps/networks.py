@@ -64,6 +64,9 @@ BLOCKS: dict[str, Callable[[int, Activation], nn.Module]] = {
 # no written-out backward pass
 SKIPS = {"plain": None, "post": "post", "pre": "pre"}
 INITIALISATIONS = ("xavier", "kaiming", "siren")
+# what the features of a point add to the output past the network: nothing, or a linear function;
+# fitted: one that starts as the surface's best (see :mod:`nsm.tasks.least_squares`)
+READOUTS = ("none", "linear", "fitted")
 
 
 class NeuralMap(nn.Module):
@@ -77,6 +80,8 @@ class NeuralMap(nn.Module):
         activation: ``{"name": ..., parameters}``; see :mod:`nsm.maps.activations`.
         encoding: ``{"name": ..., parameters}``; see :mod:`nsm.maps.encodings`.
         initialisation: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
+        readout: ``none``; ``linear``: a linear function of the encoding's features, zero at the
+            start, is added to the output; ``fitted``: the same, for a task that fits it.
     """
 
     def __init__(
@@ -88,6 +93,7 @@ class NeuralMap(nn.Module):
         activation: dict[str, Any] | None = None,
         encoding: dict[str, Any] | None = None,
         initialisation: str = "kaiming",
+        readout: str = "none",
     ) -> None:
         super().__init__()
         activation = dict(activation or {"name": "softplus"})
@@ -100,6 +106,7 @@ class NeuralMap(nn.Module):
             "activation": dict(activation),
             "encoding": dict(encoding),
             "initialisation": initialisation,
+            "readout": readout,
         }
         if block not in BLOCKS:
             raise ValueError(f"block {block!r} is not one of {', '.join(BLOCKS)}")
@@ -107,6 +114,8 @@ class NeuralMap(nn.Module):
             raise ValueError(
                 f"initialisation {initialisation!r} is not one of {', '.join(INITIALISATIONS)}"
             )
+        if readout not in READOUTS:
+            raise ValueError(f"readout {readout!r} is not one of {', '.join(READOUTS)}")
         name = encoding.pop("name")
         if name not in ENCODINGS:
             raise ValueError(f"encoding {name!r} is not one of {', '.join(ENCODINGS)}")
@@ -115,6 +124,11 @@ class NeuralMap(nn.Module):
         self.input = nn.Linear(self.encoding.out_dim, width)
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
         self.output = nn.Linear(width, out_dim)
+        self.readout: nn.Linear | None = None
+        if readout != "none":
+            self.readout = nn.Linear(self.encoding.out_dim, out_dim)
+            nn.init.zeros_(self.readout.weight)
+            nn.init.zeros_(self.readout.bias)
         modules = (self.input, *self.blocks.modules(), self.output)
         self.layers = [m for m in modules if isinstance(m, nn.Linear)]
         self._initialise(initialisation)
@@ -142,7 +156,9 @@ class NeuralMap(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) points of Ω to (N, out_dim)."""
-        return self._after(self.encoding(x))
+        features = self.encoding(x)
+        y = self._after(features)
+        return y if self.readout is None else y + self.readout(features)
 
     def _after(self, features: Tensor) -> Tensor:
         """What comes after the encoding."""
@@ -157,7 +173,7 @@ class NeuralMap(nn.Module):
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
-        s = value_and_jacobian_stack(self.encoding, x)
+        s = features = value_and_jacobian_stack(self.encoding, x)
         if self.config["block"] in SKIPS:
             s = Trunk.apply(
                 s,
@@ -168,6 +184,9 @@ class NeuralMap(nn.Module):
             )
         else:
             s = pushed_forward(self._after, s)
+        if self.readout is not None:
+            s = s + features @ self.readout.weight.t()
+            s = torch.cat([s[:1] + self.readout.bias, s[1:]])
         return s[0], s[1:].permute(1, 2, 0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
@@ -31,6 +32,7 @@ from nsm.results import (
 from nsm.results.callbacks import Pictures
 from nsm.surfaces import Surface
 from nsm.tasks import Overfit
+from nsm.tasks.least_squares import fit_readout
 
 
 def run_overfit(
@@ -83,19 +85,23 @@ def run_overfit(
 
 
 def build_overfit(config: DictConfig, surface: Surface) -> Overfit:
-    """The overfit task's module, seeded.
+    """The overfit task's module, seeded, and fitted where ``map.readout`` says so.
 
     Raises:
         NsmError: settings of the network, optimiser or schedule that do not fit together.
     """
-    return built(
-        config,
-        lambda common: Overfit(
+
+    def make(common: dict[str, Any]) -> Overfit:
+        module = Overfit(
             **with_map(common, out_dim=3),
             lambda_normal=float(config.energy.lambda_normal),
             diagonal=surface.bounding_box_diagonal,
-        ),
-    )
+        )
+        if config.map.readout == "fitted":
+            fit_readout(module.map, surface, seed=config.seed)
+        return module
+
+    return built(config, make)
 
 
 def _write_artefacts(folder: Path, neural: NeuralSurface) -> None:

@@ -7,7 +7,7 @@ from nsm.results.collection_pictures import figures_picture, transfer_matrix_pic
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh
-from nsm.results.metrics import overfit_metrics, vertex_error
+from nsm.results.metrics import overfit_metrics, pointwise_metrics, vertex_error
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.pair_pictures import (
     distortion_picture,
@@ -60,6 +60,7 @@ __all__ = [
     "overfit_metrics",
     "parameterization_picture",
     "planar_metrics",
+    "pointwise_metrics",
     "reconstruction_image",
     "save_surface",
     "vertex_error",

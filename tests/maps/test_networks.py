@@ -28,6 +28,21 @@ def randomised(config: dict) -> torch.nn.Module:
     return net
 
 
+@pytest.mark.parametrize(
+    "encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}"
+)
+def test_a_read_out_adds_a_linear_function_of_the_features(encoding):
+    net = randomised({"width": 8, "depth": 1, "encoding": encoding, "readout": "linear"})
+    x = points()
+    value, jacobian = net.value_and_jacobian(x)
+    expected = torch.func.vmap(torch.func.jacfwd(lambda p: net(p[None])[0]))(x)
+    torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-9)
+    net.output.weight.data.zero_()
+    net.output.bias.data.zero_()
+    torch.testing.assert_close(net(x), net.readout(net.encoding(x)), rtol=0, atol=1e-12)
+    assert not torch.allclose(value, net(x))
+
+
 @pytest.mark.parametrize("block", BLOCKS)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize(
@@ -47,11 +62,12 @@ def test_agrees_with_jacfwd(block, activation, encoding):
     assert ((jacobian - expected).abs().max() / scale) < 1e-10
 
 
+@pytest.mark.parametrize("readout", ["none", "linear"])
 @pytest.mark.parametrize(
     "encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}"
 )
-def test_parameter_gradient_of_a_jacobian_loss(encoding):
-    net = randomised({"width": 8, "depth": 1, "encoding": encoding})
+def test_parameter_gradient_of_a_jacobian_loss(encoding, readout):
+    net = randomised({"width": 8, "depth": 1, "encoding": encoding, "readout": readout})
     x = points(6)
     loss = net.value_and_jacobian(x)[1].square().sum()
     loss.backward()

@@ -1,0 +1,275 @@
+"""What makes a training need fewer steps: one change from the default at a time, at equal time.
+
+Each trial overfits one mesh with the default settings and one thing changed, for a budget of CPU
+time of one thread, from the network's making on, start values included. Errors are taken at marks
+on points that no training sees; that time does not count. A schedule with an end follows the clock:
+it ends with the budget, as with ``trainer.max_steps`` set to the steps that the budget holds,
+whatever else the machine does.
+
+One JSON file for each mesh and trial; those that are there already are left alone, so that an
+interrupted run goes on where it stopped:
+
+    python benchmarks/steps.py --meshes FOLDER [--names MESH ...] [--only TRIAL ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import re
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from rich.console import Console
+from training import MESHES, Clock, surface_of, train
+
+from nsm.config import compose_config
+from nsm.pipeline import quiet_lightning
+from nsm.results import atomic_write, pointwise_metrics
+from nsm.results.wrinkles import normal_variation
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results" / "steps"
+PICTURES = ROOT / "docs" / "pictures"
+NAMES = ("bunny", "shrec07-384", "igea")
+MARKS = (5.0, 10.0, 20.0, 30.0)  # seconds of one thread
+STEPS = 3300  # about what the default makes of the budget
+HELD_OUT = 30_000
+
+# by topic, what is changed from the default
+TRIALS: dict[str, dict[str, list[str]]] = {
+    "default": {
+        "default": [],
+        "default, seed 1": ["seed=1"],
+        "default, seed 2": ["seed=2"],
+        "paper": ["experiment=paper"],
+    },
+    "encoding": {
+        "no encoding": ["encoding=identity"],
+        "no encoding, residual 128 × 4": ["encoding=identity", "map=residual"],
+        "Fourier, 64, σ = 2": ["encoding=fourier"],
+        "Fourier, 128, σ = 4": [
+            "encoding=fourier",
+            "encoding.features=128",
+            "encoding.sigma=4",
+        ],
+        "Fourier, 64, σ = 2, residual 128 × 4": ["encoding=fourier", "map=residual"],
+        "grid 256": ["encoding.resolutions=[256]"],
+        "grid 16, 64": ["encoding.resolutions=[16,64]"],
+        "grid 64, 256": ["encoding.resolutions=[64,256]"],
+        "grid 16, 64, 256, 512": ["encoding.resolutions=[16,64,256,512]"],
+        "grid 32, 128, 512": ["encoding.resolutions=[32,128,512]"],
+        "grid 16, 32, 64, 128, 256": ["encoding.resolutions=[16,32,64,128,256]"],
+        "grid of 2 features": ["encoding.features=2"],
+        "grid of 8 features": ["encoding.features=8"],
+        "grid of degree 3": ["encoding.degree=3"],
+    },
+    "least squares": {
+        "read-out of features": ["map.readout=linear"],
+        "fitted": ["map.readout=fitted"],
+        "fitted, rates 1e-4": [
+            "map.readout=fitted",
+            "optimizer.lr=1e-4",
+            "optimizer.encoding_lr=1e-4",
+        ],
+        "fitted, rates 1e-3, 1e-4": [
+            "map.readout=fitted",
+            "optimizer.lr=1e-3",
+            "optimizer.encoding_lr=1e-4",
+        ],
+        "fitted, 32, 128, 512, rates 1e-4": [
+            "map.readout=fitted",
+            "encoding.resolutions=[32,128,512]",
+            "optimizer.lr=1e-4",
+            "optimizer.encoding_lr=1e-4",
+        ],
+        "fitted, Fourier, 64": ["map.readout=fitted", "encoding=fourier"],
+    },
+    "network": {
+        "32 × 1": ["map.width=32"],
+        "128 × 1": ["map.width=128"],
+        "64 × 2": ["map.depth=2"],
+        "64 × 2, residual": ["map.depth=2", "map.block=pre"],
+        "SiLU": ["activation=silu"],
+    },
+    "domain": {
+        "Tutte": ["surface.parameterization=tutte"],
+        "SLIM, boundary held": ["surface.parameterization=slim_held"],
+        "square": ["domain=square"],
+    },
+    "samples": {
+        "no vertices": ["sampler=fresh"],
+        "half vertices": ["data.vertex_share=0.5"],
+        "pool of 500,000": ["sampler=pool"],
+        "batch 256": ["data.batch_size=256"],
+        "batch 512": ["data.batch_size=512"],
+        "batch 2,048": ["data.batch_size=2048"],
+        "batch 8,192": ["data.batch_size=8192"],
+    },
+    "optimiser": {
+        "AdamW": ["optimizer=adamw", "optimizer.lr=3e-3", "optimizer.encoding_lr=3e-2"],
+        "RMSProp": ["optimizer=rmsprop", "optimizer.lr=3e-3", "+optimizer.encoding_lr=3e-2"],
+        "SGD": ["optimizer=sgd", "optimizer.lr=3e-2", "+optimizer.encoding_lr=10"],
+        "Adam, rates a third": ["optimizer.lr=1e-3", "optimizer.encoding_lr=1e-2"],
+        "Adam, rates tripled": ["optimizer.lr=1e-2", "optimizer.encoding_lr=1e-1"],
+        "Adam, one rate": ["optimizer.encoding_lr=3e-3"],
+        "Adam, β₂ = 0.999": ["optimizer.betas=[0.9,0.999]"],
+    },
+    "schedule": {
+        "constant": ["scheduler=constant"],
+        "warm restarts": ["scheduler=sgdr"],
+        "cosine, no warmup": ["scheduler.warmup=0"],
+    },
+    "loss": {
+        "no normals": ["lambda=positions"],
+        "λ_n = 0.001": ["energy.lambda_normal=0.001"],
+    },
+}
+
+
+class OnTheClock(Clock):
+    """A schedule that comes to an end does so with the budget."""
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        def by_time(factor: Any) -> Any:
+            return lambda _: factor(STEPS * min(1.0, self.spent / self.budget))
+
+        if pl_module.hparams["scheduler"]["name"] == "cosine":
+            for configured in trainer.lr_scheduler_configs:
+                scheduler: Any = configured.scheduler
+                scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
+
+
+def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
+    """Errors at the marks of one mesh's training with these overrides."""
+    config = compose_config([*words, f"trainer.max_steps={STEPS}"])
+    place = {"domain": config.domain, "parameterization": config.surface.parameterization}
+    surface = surface_of(name, meshes, **place)
+    curve: list[dict[str, Any]] = []
+
+    def at_mark(module: Any, seconds: float, step: int) -> None:
+        found = pointwise_metrics(surface, module.map.eval(), samples=HELD_OUT)
+        curve.append({"cpu_seconds": seconds, "steps": step, **found})
+        module.map.train()
+
+    module = train(config, surface, [OnTheClock(MARKS, at_mark)], max_steps=-1)[1]
+    return {"curve": curve, "wrinkles": normal_variation(surface, module.map.eval())}
+
+
+def slug(trial_name: str) -> str:
+    """A trial's name as a file's."""
+    plain = trial_name.replace("×", "x").replace("σ", "sigma").replace("λ", "lambda")
+    plain = plain.replace("β₂", "beta2").replace("500,000", "500000")
+    return re.sub(r"[^a-z0-9.=]+", "-", plain.lower()).strip("-")
+
+
+def results() -> dict[str, dict[str, Any]]:
+    """All that is there: mesh to trial to what was found, in the order of TRIALS."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in NAMES:
+        for trials in TRIALS.values():
+            for key in trials:
+                file = RESULTS / name / f"{slug(key)}.json"
+                if file.exists():
+                    found.setdefault(name, {})[key] = json.loads(file.read_text())
+    return found
+
+
+def tables() -> str:
+    """All results as Markdown: RMS in percent of the diagonal at each mark, normals at the end."""
+    parts = []
+    for name, found in results().items():
+        head = ["trial", *(f"{mark:g} s" for mark in MARKS), "normals", "wrinkles", "steps"]
+        lines = [f"## {name}", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+        for trials in TRIALS.values():
+            for key in (key for key in trials if key in found):
+                curve, wrinkles = found[key]["curve"], found[key]["wrinkles"]
+                cells = [f"{point['rms_percent']:.3f}" for point in curve]
+                cells.append(f"{curve[-1]['normal_error_mean_degrees']:.2f}°")
+                cells.append(f"{wrinkles['normal_variation_error_degrees']:.2f}°")
+                cells.append(f"{curve[-1]['steps']}")
+                lines.append(f"| {key} | " + " | ".join(cells) + " |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def picture(name: str, found: dict[str, Any]) -> None:
+    """The curves of one mesh, a panel for each topic, the default in each."""
+    from matplotlib.figure import Figure
+
+    topics = {
+        topic: shown
+        for topic, trials in TRIALS.items()
+        if (shown := [key for key in trials if key in found])
+    }
+    columns = 3
+    rows = -(-len(topics) // columns)
+    figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for axis, (topic, shown) in zip(axes, topics.items(), strict=False):
+        for key in shown if topic == "default" else ["default", *shown]:
+            curve = found[key]["curve"] if key in found else []
+            axis.plot(
+                [point["cpu_seconds"] for point in curve],
+                [point["rms_percent"] for point in curve],
+                label=key,
+                marker="o",
+                markersize=3,
+                **({"color": "black", "linewidth": 2.5} if key == "default" else {}),
+            )
+        axis.set(title=topic, xscale="log", yscale="log")
+        axis.set_xticks(MARKS, [f"{mark:g}" for mark in MARKS])
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    for axis in axes[len(topics) :]:
+        axis.set_axis_off()
+    figure.supxlabel("seconds of one CPU thread")
+    figure.supylabel("RMS distance, % of the diagonal")
+    figure.savefig(PICTURES / f"steps-{name}.png", dpi=90)
+
+
+def main() -> None:
+    every = [key for trials in TRIALS.values() for key in trials]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--meshes", type=Path, help="folder with the mesh files; else fetched")
+    parser.add_argument("--names", nargs="+", default=list(NAMES), choices=list(MESHES))
+    parser.add_argument("--only", nargs="+", default=every, choices=every, metavar="TRIAL")
+    parser.add_argument("--no-tables", action="store_true", help="leave table and pictures")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    quiet_lightning()
+    console = Console()
+    for name in arguments.names:
+        for topic, trials in TRIALS.items():
+            for key in (key for key in trials if key in arguments.only):
+                file = RESULTS / name / f"{slug(key)}.json"
+                if file.exists():
+                    continue
+                words = {
+                    "mesh": name,
+                    "topic": topic,
+                    "trial": key,
+                    "overrides": trials[key],
+                    "torch": torch.__version__,
+                    "machine": platform.machine(),
+                    **trial(trials[key], name, arguments.meshes),
+                }
+                file.parent.mkdir(parents=True, exist_ok=True)
+                atomic_write(file, (json.dumps(words, indent=1) + "\n").encode())
+                last = words["curve"][-1]
+                console.print(f"{name}, {key}: {last['rms_percent']:.3f} %")
+    if arguments.no_tables:
+        return
+    for name, found in results().items():
+        picture(name, found)
+    text = tables()
+    (RESULTS.parent / "steps.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

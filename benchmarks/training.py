@@ -1,0 +1,89 @@
+"""Trainings as the benchmarks run them: on one thread of the CPU, by its time."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.callbacks import Callback
+
+from nsm.data import OverfitData
+from nsm.pipeline import build_overfit
+from nsm.surfaces import Surface
+
+MESHES = {
+    "cow": "cow.obj",
+    "bunny": "stanford-bunny.obj",
+    "shrec07-384": "shrec07-384.off",
+    "igea": "igea.ply",
+}
+
+
+def surface_of(name: str, meshes: Path | None, **settings: Any) -> Surface:
+    """A mesh of a folder, or, without one, of the catalogue, prepared."""
+    return Surface.load(meshes / MESHES[name] if meshes else name, **settings)
+
+
+class Clock(Callback):
+    """Stop after a budget of CPU time; call back at marks. Time spent there does not count."""
+
+    def __init__(self, marks: Sequence[float], at_mark: Callable[[Any, float, int], None]) -> None:
+        self.marks, self.at_mark = list(marks), at_mark
+        self.budget, self.aside = marks[-1], 0.0
+        self.start = time.process_time()
+
+    @property
+    def spent(self) -> float:
+        """Seconds of the CPU since the clock was made, but for those at marks."""
+        return time.process_time() - self.start - self.aside
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any
+    ) -> None:
+        spent = self.spent
+        while self.marks and spent >= self.marks[0]:
+            before = time.process_time()
+            self.at_mark(pl_module, self.marks.pop(0), trainer.global_step)
+            self.aside += time.process_time() - before
+        trainer.should_stop = trainer.should_stop or not self.marks
+
+
+def train(
+    config: DictConfig,
+    surface: Surface,
+    callbacks: list[Callback],
+    max_steps: int | None = None,
+) -> tuple[pl.Trainer, Any, float]:
+    """The trainer, the module and the seconds of the CPU that the training took.
+
+    Args:
+        config, surface: what is trained.
+        callbacks: of Lightning.
+        max_steps: after which the training ends, -1 for never; without it where its schedule does.
+    """
+    start = time.process_time()
+    module = build_overfit(config, surface)
+    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=config.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = pl.Trainer(
+            accelerator="cpu",
+            devices=1,
+            max_steps=config.trainer.max_steps if max_steps is None else max_steps,
+            max_epochs=-1,
+            callbacks=callbacks,
+            gradient_clip_val=config.trainer.gradient_clip,
+            logger=False,
+            default_root_dir=folder,
+            limit_val_batches=0,
+            num_sanity_val_steps=0,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            enable_checkpointing=False,
+        )
+        trainer.fit(module, datamodule=data)
+    return trainer, module, time.process_time() - start

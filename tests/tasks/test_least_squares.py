@@ -1,0 +1,99 @@
+"""The least-squares start: exact on what the features span."""
+
+import numpy as np
+import pytest
+import torch
+
+from nsm.config import compose_config
+from nsm.errors import NsmError
+from nsm.maps import build_map
+from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
+from nsm.pipeline import build_overfit
+from nsm.results import pointwise_metrics
+from nsm.surfaces import Surface
+from nsm.tasks.least_squares import _fit_tables, fit_readout
+
+GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}
+MATRIX = np.array([[1.0, 0.3], [-0.2, 0.8], [0.5, 0.1]])
+
+
+def sheet(height) -> Surface:
+    """The square [-1, 1]² itself, carried to space by MATRIX and a height."""
+    line = np.linspace(-1, 1, 41)
+    uv = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+    a = (np.arange(40)[:, None] * 41 + np.arange(40)).ravel()
+    faces = np.concatenate([np.stack([a, a + 41, a + 42], 1), np.stack([a, a + 42, a + 1], 1)])
+    vertices = uv @ MATRIX.T
+    vertices[:, 2] += height(*uv.T)
+    return Surface(
+        name="sheet",
+        vertices=vertices,
+        faces=faces,
+        uv=uv,
+        domain="square",
+        source_vertex=np.arange(len(uv)),
+        twins=np.zeros((0, 2), dtype=np.int64),
+        scale=1.0,
+        center=np.zeros(3),
+    )
+
+
+@pytest.mark.parametrize(
+    "encoding", [GRID, {"name": "fourier", "features": 4}, {"name": "identity"}]
+)
+def test_a_plane_is_met_exactly(encoding):
+    """Affine functions are in the span of every encoding."""
+    network = build_map({"width": 8, "depth": 1, "encoding": encoding, "readout": "fitted"})
+    flat = sheet(lambda u, v: 0 * u + 2)
+    fit_readout(network, flat)
+    uv = torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    value, jacobian = network.value_and_jacobian(uv)
+    expected = uv @ torch.tensor(MATRIX.T, dtype=torch.float32) + torch.tensor([0.0, 0.0, 2.0])
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-4)
+    wanted = torch.tensor(MATRIX, dtype=torch.float32).expand_as(jacobian)
+    torch.testing.assert_close(jacobian, wanted, rtol=0, atol=1e-3)
+
+
+def test_a_spline_of_the_grid_is_found_again():
+    torch.manual_seed(0)
+    grid, found = SplineGrid(2, [4, 8], 3), SplineGrid(2, [4, 8], 3)
+    readout = torch.nn.Linear(grid.out_dim, 3)
+    with torch.no_grad():
+        for table in grid.tables:
+            table.normal_()
+        uv = 2 * torch.rand(4000, 2) - 1
+        along = torch.eye(2, dtype=torch.float64).expand(len(uv), 2, 2)
+
+        def spline(stack):  # each level adds to the same three coordinates
+            return stack[:, :, 2:5] + stack[:, :, 5:8]
+
+        target = spline(value_and_jacobian_stack(grid, uv)).double()
+        _fit_tables(found, readout, uv, along, target)
+        stack = value_and_jacobian_stack(found, uv) @ readout.weight.t()
+        stack[0] += readout.bias
+    torch.testing.assert_close(stack, target.float(), rtol=0, atol=5e-3)
+
+
+def test_a_curved_surface_is_met_before_any_training():
+    wave = sheet(lambda u, v: 0.2 * np.sin(2 * u) * np.cos(v))
+    words = ["domain=square", "encoding.resolutions=[8,32]", "seed=3"]
+    fitted, plain = (
+        pointwise_metrics(
+            wave, build_overfit(compose_config([*words, f"map.readout={r}"]), wave).map
+        )
+        for r in ("fitted", "linear")
+    )
+    assert fitted["rms_percent"] < 0.02 < 5 < plain["rms_percent"]
+    assert fitted["normal_error_mean_degrees"] < 1
+
+
+def test_too_few_features_are_told():
+    config = compose_config(["map.readout=fitted", "encoding.features=2", "domain=square"])
+    with pytest.raises(NsmError, match="needs 3 features"):
+        build_overfit(config, sheet(lambda u, v: 0 * u))
+
+
+def test_maps_of_the_plane_have_nothing_to_fit():
+    with pytest.raises(NsmError, match="map.readout"):
+        compose_config(["task=param", "map.readout=fitted"])
+    compose_config(["task=param", "map.readout=linear"])
