@@ -24,7 +24,7 @@ docs: .venv/.nsm-docs
 bench: .venv/.nsm-dev
 	$(BIN)/python benchmarks/overfit.py $(if $(MESHES),--meshes $(MESHES))
 
-# What makes a training need fewer steps, one change at a time: about a minute for each mesh and trial.
+# What makes a training need fewer steps: a minute for each mesh and trial. MESHES as above.
 bench-steps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/steps.py $(if $(MESHES),--meshes $(MESHES))
 

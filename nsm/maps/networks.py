@@ -185,9 +185,21 @@ class NeuralMap(nn.Module):
         else:
             s = pushed_forward(self._after, s)
         if self.readout is not None:
-            s = s + features @ self.readout.weight.t()
-            s = torch.cat([s[:1] + self.readout.bias, s[1:]])
+            s = read_out(s, features, self.readout.weight, self.readout.bias)
         return s[0], s[1:].permute(1, 2, 0)
+
+
+def read_out(stack: Tensor, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """A linear function of features, with its tangents, added to a stack.
+
+    Args:
+        stack: (3, N, d), or (k, 3, N, d) of k networks.
+        features: (3, N, d') or (k, 3, N, d').
+        weight, bias: (d, d') and (d,), or (k, d, d') and (k, d).
+    """
+    out = stack + features @ weight.mT.unsqueeze(-3)
+    out.select(-3, 0).add_(bias.unsqueeze(-2))
+    return out
 
 
 def build_map(config: dict[str, Any]) -> NeuralMap:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nsm.maps.composition import PointMap, Rotated
 from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
-from nsm.maps.networks import SKIPS, NeuralMap
+from nsm.maps.networks import SKIPS, NeuralMap, read_out
 from nsm.maps.planar import FromIdentity
 from nsm.maps.trunk import Trunk
 
@@ -39,13 +39,20 @@ class Alike(nn.Module):
         parameters = zip(
             *([p for m in n.layers for p in (m.weight, m.bias)] for n in networks), strict=True
         )
+        features = self._encoded(x)
         stack = Trunk.apply(
-            self._encoded(x),
+            features,
             networks[0].activation,
             SKIPS[networks[0].config["block"]],
             torch.is_grad_enabled(),
             *(torch.stack(same) for same in parameters),
         )
+        linear = [n.readout for n in networks if n.readout is not None]
+        if linear:
+            weight, bias = (
+                torch.stack(w) for w in zip(*((m.weight, m.bias) for m in linear), strict=True)
+            )
+            stack = read_out(stack, features, weight, bias)
         return stack[:, 0], stack[:, 1:].permute(0, 2, 3, 1)
 
     def _encoded(self, x: Tensor) -> Tensor:

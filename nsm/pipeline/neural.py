@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import pytorch_lightning as pl
 from filelock import FileLock
@@ -17,6 +18,7 @@ from rich.console import Console
 from nsm.config import compose_config
 from nsm.data import SeveralData
 from nsm.errors import NsmError
+from nsm.maps import NeuralMap
 from nsm.pipeline.common import (
     CHECKPOINT_FILE,
     CONFIG_FILE,
@@ -41,6 +43,7 @@ from nsm.results.files import atomic_write
 from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.tasks import OverfitSeveral
+from nsm.tasks.least_squares import fit_readout
 
 # settings that do not change what a neural surface becomes
 _INCIDENTAL = (
@@ -148,15 +151,19 @@ def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Cons
 def _trained_together(
     config: DictConfig, folder: Path, surfaces: Sequence[Surface], console: Console
 ) -> tuple[OverfitSeveral, pl.Trainer]:
-    module = built(
-        config,
-        lambda common: OverfitSeveral(
+    def make(common: dict[str, Any]) -> OverfitSeveral:
+        module = OverfitSeveral(
             seed=config.seed,
             **with_map(common, out_dim=3),
             lambda_normal=float(config.energy.lambda_normal),
             diagonals=[surface.bounding_box_diagonal for surface in surfaces],
-        ),
-    )
+        )
+        if config.map.readout == "fitted":
+            for network, surface in zip(module.maps, surfaces, strict=True):
+                fit_readout(cast(NeuralMap, network), surface, seed=config.seed)
+        return module
+
+    module = built(config, make)
     first = surfaces[0]
     trainer = fitted(
         config,

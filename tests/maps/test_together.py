@@ -17,6 +17,7 @@ NETWORKS: list[dict[str, Any]] = [
     {"depth": 2, "block": "post", "encoding": {**GRID, "degree": 3}},
     {"depth": 3, "block": "pre", "encoding": {"name": "fourier", "features": 8}},
     {"depth": 2, "block": "post", "activation": {"name": "silu"}},
+    {"depth": 1, "block": "plain", "encoding": GRID, "readout": "linear"},
 ]
 
 
