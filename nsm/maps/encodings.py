@@ -225,10 +225,13 @@ class SplineGrid(nn.Module):
         )
         self.out_dim = in_dim + features * len(self.resolutions)
 
-    def _seen(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
-        """Rows (L, k², N) of the tables that points (N, 2) see, and the weights (L, 2, N) of the
-        k rows along each axis, with their first and second derivatives by x."""
-        size = torch.tensor(self.resolutions, device=x.device)[:, None, None]
+    def _seen(
+        self, x: Tensor, resolutions: Sequence[int] | None = None
+    ) -> tuple[Tensor, list[list[Tensor]]]:
+        """Of all levels, or those of some resolutions: rows (L, k², N) of the tables that points
+        (N, 2) see, and the weights (L, 2, N) of the k rows along each axis, with their first and
+        second derivatives by x."""
+        size = torch.tensor(resolutions or self.resolutions, device=x.device)[:, None, None]
         per_unit = size.to(x.dtype) / (2 * self.extent)
         z = (x.t() + self.extent) * per_unit
         cell = z.detach().floor().clamp(min=0).minimum(size.to(x.dtype) - 1)
@@ -253,11 +256,11 @@ class SplineGrid(nn.Module):
         Returns:
             rows (N, k²) of the table; their weights (3, N, k²) in value and both tangents.
         """
-        rows, orders = self._seen(x)
-        value, first, _ = (torch.stack(w, dim=2)[level] for w in orders)
+        rows, orders = self._seen(x, self.resolutions[level : level + 1])
+        value, first, _ = (torch.stack(w, dim=2)[0] for w in orders)
         pairs = ((value, value), (first, value), (value, first))
         blend = torch.stack([(u[0, :, None] * v[1, None]).flatten(0, 1) for u, v in pairs])
-        return rows[level].t(), blend.transpose(1, 2)
+        return rows[0].t(), blend.transpose(1, 2)
 
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""

@@ -12,20 +12,23 @@ this is Eq. 1 (METHOD) made linear.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
-from scipy.sparse import csr_matrix, diags, identity, kron
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_matrix, dia_matrix, diags, identity, kron
 from torch import Tensor, nn
 
 from nsm.data import SurfaceSampler
 from nsm.maps import NeuralMap
 from nsm.maps.encodings import Encoding, SplineGrid, value_and_jacobian_stack
 from nsm.surfaces import Surface
+from nsm.tasks.multigrid import solve
 
 # samples for each grid point or feature
-_SAMPLES = 5
+_SAMPLES = 4
 _FEWEST = 20_000
+_AT_ONCE = 65_536
 # of the tables' second differences beside the mean weight of the samples: what no sample sees goes
 # on straight
 _SMOOTH = 1e-6
@@ -96,50 +99,67 @@ def _fit_tables(
         raise ValueError(f"a grid that is fitted needs {size} features or more a level")
     nn.init.zeros_(readout.weight)
     nn.init.zeros_(readout.bias)
-    left = target.numpy()
+    left = target.clone()
     column = grid.out_dim - grid.features * len(grid.tables)
-    for level, table in enumerate(grid.tables):
+    for level, (table, cells) in enumerate(zip(grid.tables, grid.resolutions, strict=True)):
         count = min(len(uv), max(_FEWEST, _SAMPLES * len(table)))
-        design = _design(grid, level, uv, along)
-        of_part = design if count == len(uv) else _design(grid, level, uv[:count], along[:count])
-        found = _solved(of_part, left[:, :count].reshape(-1, size), grid.sides[level])
-        left = left - (design @ found).reshape(left.shape)
+        matrix, right = _normal_equations(grid, level, uv[:count], along[:count], left[:, :count])
+        found = torch.as_tensor(solve(matrix, right, cells, grid.degree))
+        behind = len(uv) if level + 1 < len(grid.tables) else 0
+        for part, rows, weights in _seen(grid, level, uv[:behind], along):
+            left[:, part] -= (weights[..., None] * found[rows]).sum(dim=2)
         # tables of entries about 1, which steps of one rate suit
-        scale = max(float(np.sqrt((found**2).mean())), 1e-30)
-        table[:, :size] = torch.as_tensor(found / scale)
+        scale = float(found.square().mean().sqrt().clamp(min=1e-30))
+        table[:, :size] = found / scale
         readout.weight[:, column : column + size] = scale * torch.eye(size)
         column += grid.features
 
 
-def _design(grid: SplineGrid, level: int, uv: Tensor, along: Tensor) -> csr_matrix:
-    """From a level's table to values and derivatives along the surface: (3 N, rows)."""
-    rows, weights = grid.seen(uv.double(), level)
-    weights = _rows(weights, along)
-    taps = rows.shape[1]
-    return csr_matrix(
-        (
-            weights.flatten().numpy(),
-            rows.repeat(3, 1).flatten().numpy(),
-            np.arange(0, weights.numel() + 1, taps),
-        ),
-        shape=(weights.numel() // taps, len(grid.tables[level])),
+def _seen(
+    grid: SplineGrid, level: int, uv: Tensor, along: Tensor
+) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """Which samples, the rows (n, k²) that they see of a level's table, and the weights (3, n, k²)
+    of these in the value and in the derivatives along the surface; part by part."""
+    for start in range(0, len(uv), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        rows, weights = grid.seen(uv[part].double(), level)
+        yield part, rows, _rows(weights, along[part])
+
+
+def _normal_equations(
+    grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor
+) -> tuple[csr_matrix, np.ndarray]:
+    """The matrix (rows, rows) and right side (rows, 3) of a level's table that fits best, its
+    second differences held small."""
+    side, taps = grid.sides[level], (grid.degree + 1) ** 2
+    size, columns = side**2, target.shape[2]
+    # sums over the samples of each cell, which see the same rows
+    products = torch.zeros(size, taps * taps, dtype=torch.float64)
+    wanted = torch.zeros(size, taps * columns, dtype=torch.float64)
+    for part, rows, weights in _seen(grid, level, uv, along):
+        pairs = torch.einsum("pna,pnb->nab", weights, weights)
+        products.index_add_(0, rows[:, 0], pairs.flatten(1))
+        with_target = torch.einsum("pna,pnk->nak", weights, target[:, part])
+        wanted.index_add_(0, rows[:, 0], with_target.flatten(1))
+    # row r of the table is the first that cell r sees; the others lie at fixed offsets from it
+    offsets = [i * side + j for i in range(grid.degree + 1) for j in range(grid.degree + 1)]
+    diagonals: dict[int, np.ndarray] = {}
+    right = np.zeros((size, columns))
+    of_pairs, of_target = (
+        products.t().contiguous().numpy(),
+        wanted.view(size, taps, columns).numpy(),
     )
-
-
-def _solved(design: csr_matrix, target: np.ndarray, side: int) -> np.ndarray:
-    """The table (side², 3) that fits best, its second differences held small."""
-    normal = (design.T @ design).tocsc()
-    weight = normal.diagonal().mean()
+    for a, down in enumerate(offsets):
+        right[down:] += of_target[: size - down, a]
+        for b, across in enumerate(offsets):
+            diagonal = diagonals.setdefault(across - down, np.zeros(size))
+            diagonal[across:] += of_pairs[a * taps + b, : size - across]
+    matrix = dia_matrix((np.stack(list(diagonals.values())), list(diagonals)), shape=(size, size))
     bend = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(side - 2, side))
     line = identity(side)
     smooth = kron(bend.T @ bend, line) + kron(line, bend.T @ bend)
-    matrix = normal + weight * (_SMOOTH * smooth + _RIDGE * identity(side**2))
-    # symmetric and positive: no pivoting, and an ordering that knows it
-    symmetric = {"SymmetricMode": True}
-    factors = splu(
-        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric
-    )
-    return factors.solve(design.T @ target)
+    weight = matrix.diagonal().mean()
+    return (matrix + weight * (_SMOOTH * smooth + _RIDGE * identity(size))).tocsr(), right
 
 
 def _fit_weights(
