@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-activation bench-speed torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-activation bench-speed bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -52,6 +52,10 @@ fuzz: .venv/.nsm-dev
 # on the GPU where there is one. MESHES adds what a user waits for with bunny and animals.
 bench-speed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/speed.py $(if $(MESHES),--meshes $(MESHES))
+
+# Meshes of a million faces and a collection of 20 surfaces, time and memory: half an hour.
+bench-scale: .venv/.nsm-dev
+	$(BIN)/python benchmarks/scale.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import published
+import scale
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
@@ -635,7 +636,14 @@ def page(results: dict[str, Any]) -> str:
             f"| {k} | {v['published_mib']:.0f} | {v['nsm_mib']:.0f} | {v['ratio']:.1f} |"
             for k, v in results["memory"].items()
         ]
+    if scale.RESULTS.exists():
+        lines += scale.section(json.loads(scale.RESULTS.read_text()))
     return "\n".join(lines) + "\n"
+
+
+def write_page() -> None:
+    """Make the page of the documentation anew of the results that are kept."""
+    PAGE.write_text(page(json.loads((RESULTS / "speed.json").read_text())))
 
 
 PARTS = ("costs", "peak", "growth", "batches", "memory", "times", "goals")
@@ -682,7 +690,7 @@ def main() -> None:
         output.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(output, (json.dumps(results, indent=1) + "\n").encode())
         if arguments.output is None and not cuda:
-            PAGE.write_text(page(results))
+            write_page()
     print(page(results))
 
 

@@ -17,13 +17,16 @@ _SHOWN = {
     "landmark_error_max_percent": "largest landmark error, % of diagonal",
 }
 _CELL = 300
+# of a larger collection, the picture of so many surfaces would be one of hundreds of megabytes
+_MOST_DRAWN = 8
 
 
 def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
     """Main figures of every ordered pair, from row to column."""
     names = [phi.surface.name for phi in collection.surfaces]
     k = len(names)
-    figure = Figure(figsize=(5.2 * len(_SHOWN), 5.0), dpi=120)
+    side = max(5.0, 0.5 * k)  # inches: the numbers do not overlap
+    figure = Figure(figsize=((side + 0.2) * len(_SHOWN), side), dpi=120)
     for n, (key, title) in enumerate(_SHOWN.items()):
         values = np.full((k, k), np.nan)
         for i in range(k):
@@ -46,12 +49,13 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
 
 
 def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> None:
-    """Row i, column j: the checkerboard of surface i carried to surface j."""
+    """Row i, column j: the checkerboard of surface i carried to surface j; of the first eight."""
     rows = []
-    views = [View(phi.surface.vertices, _CELL) for phi in collection.surfaces]
-    for i, source in enumerate(collection.surfaces):
+    drawn = collection.surfaces[:_MOST_DRAWN]
+    views = [View(phi.surface.vertices, _CELL) for phi in drawn]
+    for i, source in enumerate(drawn):
         row = []
-        for j, target in enumerate(collection.surfaces):
+        for j, target in enumerate(drawn):
             t = target.surface
             uv = source.surface.uv if i == j else collection.pair(i, j).source_uv
             title = f"{source.surface.name} → {t.name}" if i != j else t.name

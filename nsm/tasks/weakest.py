@@ -13,7 +13,7 @@ from nsm.energies import unfold
 _COUNT = 256
 _EVERY = 25  # steps between two looks at the triangles
 # triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
-_LOOK = 65_536
+_LOOK = 16_384
 
 
 class Weakest(nn.Module):

@@ -1,0 +1,264 @@
+"""Large meshes and large collections: CPU time and peak memory of each stage of a whole run.
+
+Each case is a process of its own, from raw meshes to the files in the run folder, with one thread.
+Trainings are short: their steps cost the same on every mesh, and speed.py measures those.
+
+    python benchmarks/scale.py [--cases NAME ...] [--pictures FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nsm.surfaces import shapes
+
+RESULTS = Path(__file__).parent / "results" / "scale.json"
+STEPS, PHI_STEPS = 1000, 500
+SURFACES, LIMIT_GIB = 20, 8
+LANDMARKS = [0, 400, 900, 1500]
+
+
+def bumps(points: np.ndarray, seed: int, waves: int, finest: float) -> np.ndarray:
+    """A sum of waves (N,) in all directions, from long to ``finest`` radians a unit of length."""
+    random, height = np.random.default_rng(seed), np.zeros(len(points))
+    for k in range(waves):
+        way = random.normal(size=3)
+        way *= (1.5 + finest * (k / waves) ** 1.5) / np.linalg.norm(way)
+        height += np.sin(points @ way + random.uniform(0, 2 * np.pi)) / (
+            4 + 1.4 * np.linalg.norm(way)
+        )
+    return height
+
+
+def closed_mesh() -> shapes.Mesh:
+    """A ball with bumps: 1,310,720 faces."""
+    vertices, faces = shapes.sphere(8)
+    return vertices * (1 + 0.8 * bumps(vertices, 0, 24, 12.0))[:, None], faces
+
+
+def open_mesh() -> shapes.Mesh:
+    """Hills over a square: 1,002,528 faces."""
+    vertices, faces = shapes.plane(709)
+    vertices[:, 2] = 0.5 * bumps(vertices, 1, 32, 25.0)
+    return vertices, faces
+
+
+def bowl(seed: int) -> shapes.Mesh:
+    """One of many bowls with bumps: 5,400 faces, vertices with the same numbers correspond."""
+    vertices, faces = shapes.hemisphere(30)
+    return vertices * (1 + 0.8 * bumps(vertices, 100 + seed, 12, 4.0))[:, None], faces
+
+
+def write_obj(path: Path, mesh: shapes.Mesh) -> str:
+    vertices, faces = mesh
+    with path.open("w") as stream:
+        np.savetxt(stream, vertices, fmt="v %.7f %.7f %.7f")
+        np.savetxt(stream, faces + 1, fmt="f %d %d %d")
+    return str(path)
+
+
+class Stages:
+    """CPU seconds of functions of the pipeline, and the process's peak memory at their ends."""
+
+    def __init__(self) -> None:
+        self.taken: dict[str, dict[str, float]] = {}
+
+    def around(self, module: Any, name: str, stage: str) -> None:
+        """Have ``module.name`` count for a stage, each time that it is called."""
+        inner: Callable[..., Any] = getattr(module, name)
+
+        def measured(*args: Any, **kwargs: Any) -> Any:
+            start = time.process_time()
+            try:
+                return inner(*args, **kwargs)
+            finally:
+                entry = self.taken.setdefault(stage, {"cpu_seconds": 0.0, "peak_mib": 0.0})
+                entry["cpu_seconds"] += time.process_time() - start
+                entry["peak_mib"] = peak_mib()
+
+        setattr(module, name, measured)
+
+
+def peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def overfit(mesh: Callable[[], shapes.Mesh], folder: Path) -> dict[str, Any]:
+    """task=overfit from a raw mesh."""
+    from nsm.pipeline import overfit as pipeline
+
+    stages = Stages()
+    for name, stage in (
+        ("configured_surface", "preparation"),
+        ("train", f"training, {STEPS} steps"),
+        ("overfit_metrics", "figures"),
+        ("save_surface", "saving"),
+        ("_write_artefacts", "meshes and pictures"),
+    ):
+        stages.around(pipeline, name, stage)
+    file = write_obj(folder / "mesh.obj", mesh())
+    words = ["task=overfit", f"surface.path={file}", f"trainer.max_steps={STEPS}"]
+    found = whole_run(words, folder / "run", stages)
+    return {**found, "preparation": metrics(folder)["preparation"]}
+
+
+def collection(folder: Path) -> dict[str, Any]:
+    """task=collection_map of many surfaces, all ordered pairs of them."""
+    from nsm.pipeline import collection_map as pipeline
+    from nsm.pipeline import inputs
+
+    stages = Stages()
+    for module, name, stage in (
+        (inputs, "prepare_together", "preparation"),
+        (inputs, "made_together", f"neural surfaces, {PHI_STEPS} steps"),
+        (pipeline, "fitted", f"training, {STEPS} steps"),
+        (pipeline, "guaranteed", "certificates"),
+        (pipeline, "collection_metrics", "figures"),
+        (pipeline, "_write_artefacts", "meshes and pictures"),
+    ):
+        stages.around(module, name, stage)
+    files = [write_obj(folder / f"bowl{k}.obj", bowl(k)) for k in range(SURFACES)]
+    landmarks = folder / "landmarks.json"
+    landmarks.write_text(json.dumps([LANDMARKS] * SURFACES))
+    words = ["task=collection_map", f"landmarks={landmarks}", f"trainer.max_steps={STEPS}"]
+    words += [f"surfaces=[{','.join(files)}]", f'phi.overrides=["trainer.max_steps={PHI_STEPS}"]']
+    found = whole_run(words, folder / "run", stages)
+    pairs = metrics(folder)["metrics"]["pairs"].values()
+    medians = [pair["symmetric_dirichlet_median"] for pair in pairs]
+    return {
+        **found,
+        "pairs": len(medians),
+        "certified_pairs": sum(pair["certified"] for pair in pairs),
+        "symmetric_dirichlet_median": float(np.median(medians)),
+    }
+
+
+def metrics(folder: Path) -> dict[str, Any]:
+    words: dict[str, Any] = json.loads((folder / "run" / "metrics.json").read_text())
+    return words
+
+
+def whole_run(words: list[str], folder: Path, stages: Stages) -> dict[str, Any]:
+    from nsm.config import compose_config
+    from nsm.pipeline import run
+
+    start = time.process_time()
+    run(compose_config([*words, "seed=0", "trainer.progress=false"]), folder)
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    return {
+        "stages": stages.taken,
+        "cpu_seconds": time.process_time() - start,
+        "peak_mib": peak_mib(),
+        "output_mib": size / 2**20,
+        "output_files": sum(file.is_file() for file in folder.rglob("*")),
+    }
+
+
+CASES: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {
+    "closed": ("a closed mesh of 1.31 M faces", lambda folder: overfit(closed_mesh, folder)),
+    "open": ("an open mesh of 1.00 M faces", lambda folder: overfit(open_mesh, folder)),
+    "collection": (f"a collection of {SURFACES} surfaces of 5,400 faces", collection),
+}
+
+
+def section(results: dict[str, Any]) -> list[str]:
+    """The results as a part of docs/performance.md."""
+    lines = [
+        "",
+        "## Large meshes and collections",
+        "",
+        f"Made by `make bench-scale` on {results['machine']}, one thread: from raw meshes to the "
+        "files in the run folder, with short trainings. CPU time, and the process's peak memory "
+        f"at the end of each stage; the limit is {LIMIT_GIB * 1024} MiB.",
+        "",
+        "| what | stage | CPU seconds | peak MiB |",
+        "|---|---|---|---|",
+    ]
+    for name, found in results["cases"].items():
+        for stage, taken in found["stages"].items():
+            lines.append(
+                f"| {CASES[name][0]} | {stage} | {taken['cpu_seconds']:.0f} | "
+                f"{taken['peak_mib']:.0f} |"
+            )
+        lines.append(
+            f"| | **in all** | **{found['cpu_seconds']:.0f}** | **{found['peak_mib']:.0f}** |"
+        )
+    lines.append("")
+    for name, found in results["cases"].items():
+        text = (
+            f"{CASES[name][0].capitalize()}: {found['output_files']} files of "
+            f"{found['output_mib']:.0f} MiB"
+        )
+        if "pairs" in found:
+            text += (
+                f", {found['certified_pairs']} of {found['pairs']} ordered pairs certified, "
+                f"symmetric Dirichlet {found['symmetric_dirichlet_median']:.2f} in the median."
+            )
+        else:
+            quality = found["preparation"]
+            text += (
+                f", {quality['flipped_triangles']:.0f} flipped triangles, symmetric Dirichlet of "
+                f"the domain {quality['median_symmetric_dirichlet']:.2f} in the median."
+            )
+        lines += [text, ""]
+    return lines[:-1]
+
+
+def run_case(name: str, pictures: Path | None) -> dict[str, Any]:
+    """A case in a process of its own, with empty caches."""
+    with tempfile.TemporaryDirectory() as place:
+        output = Path(place) / "found.json"
+        command = [sys.executable, __file__, "--inside", name, "--folder", place]
+        environment = {
+            **os.environ,
+            "OMP_NUM_THREADS": "1",
+            "NSM_CACHE": str(Path(place) / "cache"),
+        }
+        subprocess.run(command, check=True, env=environment)
+        if pictures is not None:
+            (pictures / name).mkdir(parents=True, exist_ok=True)
+            for file in (Path(place) / "run").glob("*.png"):
+                shutil.copy(file, pictures / name)
+        found: dict[str, Any] = json.loads(output.read_text())
+        return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES)
+    parser.add_argument("--pictures", type=Path, help="where to keep the runs' pictures")
+    parser.add_argument("--inside", choices=CASES, help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.inside:
+        found = CASES[arguments.inside][1](arguments.folder)
+        (arguments.folder / "found.json").write_text(json.dumps(found))
+        return
+    for name in arguments.cases:  # kept one by one: a long run that is stopped has its parts
+        found = run_case(name, arguments.pictures)
+        results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"cases": {}}
+        results["machine"] = f"{os.cpu_count()} CPU cores, {platform.machine()}"
+        results["cases"][name] = found
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+        import speed
+
+        speed.write_page()
+        print("\n".join(section(results)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
