@@ -40,13 +40,17 @@ bench-activation: .venv/.nsm-dev
 torture: .venv/.nsm-dev
 	$(BIN)/python benchmarks/torture
 
-# Each reader of files is fuzzed for so many seconds.
+# Each reader of files is fuzzed for so many seconds; each property is tried on so many times the
+# examples of the tests.
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks surface map pair collection
+FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks surface map pair collection checkpoint
+FUZZ_EXAMPLES ?= 20
 fuzz: .venv/.nsm-dev
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[fuzz]'
 	for target in $(FUZZ_TARGETS); do \
 	  $(BIN)/python benchmarks/fuzz.py $$target $(FUZZ_SECONDS) || exit 1; done
+	NSM_EXAMPLES=$(FUZZ_EXAMPLES) $(BIN)/python -m pytest -n auto tests/test_properties.py \
+	  tests/test_corpus.py tests/energies tests/maps
 
 # Cost of a step and time to an error, ours beside the published recipe and settings: ten minutes;
 # on the GPU where there is one. MESHES adds what a user waits for with bunny and animals.

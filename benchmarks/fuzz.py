@@ -37,6 +37,8 @@ def main() -> None:
                 (Path(seeds) / form).write_bytes(exported(tetrahedron(), form))
         elif name == "config":
             (Path(seeds) / "config").write_bytes((ROOT / "conf" / "config.yaml").read_bytes())
+        for k, data in enumerate(corpus_targets.seeds(name)):
+            (Path(seeds) / f"seed{k}").write_bytes(data)
         for file in (ROOT / "tests" / "corpus" / name).glob("*"):
             (Path(seeds) / file.name).write_bytes(file.read_bytes())
         atheris.Setup(
@@ -45,7 +47,7 @@ def main() -> None:
                 seeds,
                 f"-max_total_time={seconds}",
                 f"-artifact_prefix={crashes}/{name}-",
-                "-max_len=4096",
+                "-max_len=16384",
                 "-timeout=20",
                 "-rss_limit_mb=3000",
             ],

@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nsm.config import compose_config
+from nsm.errors import NsmError, of_disk
 from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
 from nsm.pipeline.alone import alone
 from nsm.results import (
@@ -51,6 +52,7 @@ def overfit(
         >>> phi = nsm.overfit(nsm.Surface.load("terrain"), overrides=["experiment=quick"])
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
+    _expect(surface, Surface)
     words = ["task=overfit", *overrides, f"domain={surface.domain}"]
     with _place(folder, words, progress) as (config, place):
         return run_overfit(config, place, surface)
@@ -82,6 +84,7 @@ def parameterize(
         >>> flat = nsm.parameterize(phi)
         >>> flat.uv  # (V, 2), of the cut mesh's vertices
     """
+    _expect(phi, NeuralSurface)
     words = ["task=param", *overrides, f"domain={phi.surface.domain}"]
     with _place(folder, words, progress) as (config, place):
         return run_param(config, place, phi)
@@ -153,12 +156,19 @@ def map_collection(
         >>> animals = nsm.map_collection(["a.off", "b.off", "c.off"], ["a.vts", "b.vts", "c.vts"])
         >>> animals.pair(0, 2).transfer(colours)
     """
+    if not isinstance(surfaces, Sequence):
+        raise NsmError("surfaces: give a list of them")
     words = ["task=collection_map", *overrides]
     ready = [surface for surface in surfaces if isinstance(surface, NeuralSurface)]
     if ready:
         words.append(f"domain={ready[0].surface.domain}")
     with _place(folder, words, progress) as (config, place):
         return run_collection_map(config, place, surfaces, landmarks)
+
+
+def _expect(given: Any, kind: type) -> None:
+    if not isinstance(given, kind):
+        raise NsmError(f"give a {kind.__name__}, not a {type(given).__name__}")
 
 
 @contextmanager
@@ -168,13 +178,16 @@ def _place(
     """The configuration, and the run folder: a passing one, without logs, if none is given."""
     if not progress:
         words = [*words, "trainer.progress=false"]
-    if folder is not None:
-        config = compose_config(words)
-        with alone(Path(folder)):
-            yield config, Path(folder)
-        return
-    with tempfile.TemporaryDirectory(prefix="nsm-") as temporary:
-        yield compose_config([*words, "logger=none", "artefacts=false"]), Path(temporary)
+    try:
+        if folder is not None:
+            config = compose_config(words)
+            with alone(Path(folder)):
+                yield config, Path(folder)
+            return
+        with tempfile.TemporaryDirectory(prefix="nsm-") as temporary:
+            yield compose_config([*words, "logger=none", "artefacts=false"]), Path(temporary)
+    except OSError as error:
+        raise NsmError(f"{of_disk(error)}; give another folder, or make room") from error
 
 
 def load(

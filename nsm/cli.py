@@ -14,7 +14,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from nsm.config import checked, conf_folder, one_line, register_resolvers
-from nsm.errors import NsmError
+from nsm.errors import NsmError, of_disk
+from nsm.plugins import import_plugins
 from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
@@ -41,7 +42,7 @@ def _run(config: DictConfig) -> bool:
         _say("not enough memory; give a smaller mesh, network or data.batch_size")
         return False
     except OSError as error:  # a disk that is full or read-only, a folder that may not be written
-        _say(_of_disk(error))
+        _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
         return False
     finally:
         if folder.is_dir() and not any(folder.iterdir()):
@@ -83,6 +84,7 @@ def _tasks() -> None:
         good.append(_run(config))
 
     try:
+        import_plugins()
         job()
     except NsmError as error:
         _say(str(error))
@@ -93,7 +95,7 @@ def _tasks() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except OSError as error:  # Hydra makes the run folder before anything of ours runs
-        _say(_of_disk(error))
+        _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
         sys.exit(2)
     if not all(good):
         sys.exit(2)
@@ -109,12 +111,6 @@ def _sum_up() -> None:
         _say(f"failed: {' '.join(outcome.words) or outcome.folder}: {outcome.error}")
     if failed:
         sys.exit(1)
-
-
-def _of_disk(error: OSError) -> str:
-    place = f"{error.filename}: " if error.filename else ""
-    reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
-    return f"{place}{reason}; choose another folder with hydra.run.dir=FOLDER, or make room"
 
 
 def _say(message: str) -> None:

@@ -19,6 +19,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from nsm.errors import NsmError
+from nsm.plugins import import_plugins
 from nsm.sweeps import sweep_folder
 
 
@@ -202,6 +203,7 @@ def compose_config(overrides: Sequence[str] = ()) -> DictConfig:
         NsmError: an override that names no key or has the wrong type.
     """
     register_resolvers()
+    import_plugins()
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
@@ -216,6 +218,7 @@ def checked(config: DictConfig) -> DictConfig:
     Raises:
         NsmError: a key that does not exist, a value of the wrong type or out of range.
     """
+    import_plugins()  # the jobs of a sweep may run in processes of their own
     try:
         typed = OmegaConf.merge(OmegaConf.structured(Schema), config)
         OmegaConf.resolve(typed)
@@ -283,7 +286,7 @@ def _check_values(key: str, value: Any) -> None:
             if name == "_target_":
                 raise NsmError(
                     f"setting {key or name}: '_target_' is not taken; things are made by the names "
-                    "that nsm --help lists"
+                    "that nsm --help lists, and by those that modules in NSM_PLUGINS register"
                 )
             _check_values(f"{key}.{name}" if key else str(name), item)
     elif isinstance(value, list):

@@ -16,3 +16,9 @@ class NotRegistered(NsmError):
             f"it was made with the {kind} {str(name)[:60]!r}, which is not known here; if it is "
             f"one of your own, call nsm.{register} first"
         )
+
+
+def of_disk(error: OSError) -> str:
+    """What the system said of a file or folder: where, and what is wrong."""
+    place = f"{error.filename}: " if error.filename else ""
+    return place + (error.strerror or " ".join(str(error).split()) or type(error).__name__)

@@ -1,32 +1,40 @@
-"""What is fuzzed: functions of bytes that may raise NsmError alone."""
+"""What is fuzzed: functions of bytes that may raise NsmError alone; and what they start from."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
+import json
 import tempfile
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+import torch
+from tiny import Results, results
 
+import nsm
 from nsm.config import read_config
 from nsm.errors import NsmError
-from nsm.results import load_collection, load_parameterization, load_surface, load_surface_map
+from nsm.pipeline.common import step_of
 from nsm.surfaces.landmarks import read_landmarks, read_pairs
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import clean
 
 MESHES = ("obj", "off", "ply", "stl", "gltf", "glb")
+ARTEFACTS = ("surface", "map", "pair", "collection")
 
 
-def _in_file(name: str, read: Callable[[Path], object], data: bytes) -> None:
+def _in_file(name: str, read: Callable[[Path], object], data: bytes) -> bool:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name
         file.write_bytes(data)
         with contextlib.suppress(NsmError), contextlib.redirect_stderr(io.StringIO()):
             read(file)
+            return True
+    return False
 
 
 def _mesh(file: Path) -> None:
@@ -36,26 +44,63 @@ def _mesh(file: Path) -> None:
     assert np.isfinite(cleaned.vertices).all() and len(cleaned.faces)
 
 
-def _artefact(stem: str, read: Callable[[Path], object], data: bytes) -> None:
-    """The first line is the JSON, with the checksum of the rest, which are the arrays."""
-    import hashlib
+@cache
+def _tiny() -> Results:
+    return results(rings=1)
 
+
+def _saved(stem: str, folder: Path) -> None:
+    tiny = _tiny()
+    {"surface": tiny.neural[0], "map": tiny.flat, "pair": tiny.pair, "collection": tiny.trio}[
+        stem
+    ].save(folder)
+
+
+def _artefact(stem: str, data: bytes) -> bool:
+    """The first line is the JSON, with the checksum of the rest, which are the arrays; what else
+    is in the folder is as it should be. What is loaded is used."""
     words, _, arrays = data.partition(b"\n")
     words = words.replace(b"SHA256", hashlib.sha256(arrays).hexdigest().encode())
-    with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / f"{stem}.json").write_bytes(words)
-        (Path(folder) / f"{stem}.safetensors").write_bytes(arrays)
-        with contextlib.suppress(NsmError):
-            read(Path(folder))
+    with tempfile.TemporaryDirectory() as name, contextlib.suppress(NsmError):
+        folder = Path(name)
+        _saved(stem, folder)
+        (folder / f"{stem}.json").write_bytes(words)
+        (folder / f"{stem}.safetensors").write_bytes(arrays)
+        thing = nsm.load(folder)
+        points = np.array([[0.1, 0.2], [-0.5, 0.3]])
+        if isinstance(thing, nsm.SurfaceCollection):
+            thing = thing.pair(0, 1)
+        if isinstance(thing, nsm.SurfaceMap):
+            thing(np.pad(points, ((0, 0), (0, 1))))
+            thing.planar(points)
+        else:
+            thing(points)
+        return True
+    return False
 
 
-TARGETS: dict[str, Callable[[bytes], None]] = {
+def seeds(name: str) -> list[bytes]:
+    """Valid input for a target that reads what nsm itself writes."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        if name == "checkpoint":
+            state = {"weight": torch.zeros(2, 3), "bias": torch.nn.Parameter(torch.ones(2))}
+            torch.save({"global_step": 7, "state_dict": state}, folder / "last.ckpt")
+            return [(folder / "last.ckpt").read_bytes()]
+        if name not in ARTEFACTS:
+            return []
+        _saved(name, folder)
+        words = json.loads((folder / f"{name}.json").read_text())
+        line = json.dumps({**words, "sha256": "SHA256"}, separators=(",", ":")).encode()
+        return [line + b"\n" + (folder / f"{name}.safetensors").read_bytes()]
+
+
+# from bytes to whether they were taken; any exception is a finding
+TARGETS: dict[str, Callable[[bytes], bool]] = {
     **{kind: partial(_in_file, f"mesh.{kind}", _mesh) for kind in MESHES},
     "config": partial(_in_file, "config.yaml", read_config),
     "pairs": partial(_in_file, "pairs.json", read_pairs),
     "landmarks": partial(_in_file, "landmarks.vts", read_landmarks),
-    "surface": partial(_artefact, "surface", load_surface),
-    "map": partial(_artefact, "map", load_parameterization),
-    "pair": partial(_artefact, "pair", load_surface_map),
-    "collection": partial(_artefact, "collection", load_collection),
+    "checkpoint": partial(_in_file, "last.ckpt", step_of),
+    **{stem: partial(_artefact, stem) for stem in ARTEFACTS},
 }

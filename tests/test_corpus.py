@@ -1,16 +1,12 @@
-"""Cases that a fuzzer found, and arbitrary input: NsmError or a right result, nothing else."""
+"""What a fuzzer found in the readers of files, and any bytes: NsmError or a right result."""
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from corpus_targets import TARGETS
-from hypothesis import given, settings
+from corpus_targets import TARGETS, seeds
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
-
-from nsm.errors import NsmError
-from nsm.surfaces import Surface
+from thorough import examples
 
 CORPUS = Path(__file__).parent / "corpus"
 
@@ -22,40 +18,18 @@ def test_found_cases(name):
 
 
 @pytest.mark.parametrize("name", TARGETS)
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(data=st.binary(max_size=300))
 def test_any_bytes(name, data):
     TARGETS[name](data)
 
 
-_DTYPES = st.sampled_from([np.float64, np.float32, np.int32, np.int64, bool, complex])
-_SHAPES = arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    vertices=arrays.arrays(_DTYPES, _SHAPES),
-    faces=arrays.arrays(_DTYPES, _SHAPES),
-)
-def test_surfaces_of_any_arrays(vertices, faces):
-    try:
-        surface = Surface.from_arrays(vertices, faces)
-    except NsmError:
-        return
-    assert surface.quality["flipped_triangles"] == 0
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    vertices=arrays.arrays(
-        np.float64, (6, 3), elements=st.floats(-1e6, 1e6) | st.sampled_from([np.nan, np.inf, 0.0])
-    ),
-    faces=arrays.arrays(np.int64, (5, 3), elements=st.integers(-1, 6)),
-)
-def test_surfaces_of_any_few_triangles(vertices, faces):
-    try:
-        surface = Surface.from_arrays(vertices, faces)
-    except NsmError:
-        return
-    assert surface.quality["flipped_triangles"] == 0
-    assert np.isfinite(surface.uv).all()
+@pytest.mark.parametrize("name", TARGETS)
+@examples(10)
+@given(data=st.data())
+def test_valid_files_with_a_part_exchanged(name, data):
+    for seed in seeds(name):
+        assert TARGETS[name](seed)
+        start = data.draw(st.integers(0, len(seed)))
+        end = data.draw(st.integers(start, min(len(seed), start + 40)))
+        TARGETS[name](seed[:start] + data.draw(st.binary(max_size=20)) + seed[end:])

@@ -16,11 +16,14 @@ from safetensors.numpy import load_file, save_file
 import nsm
 from nsm.config import read_config
 from nsm.errors import NsmError
+from nsm.maps import ACTIVATIONS
 from nsm.results.files import check_stored
+from nsm.surfaces.landmarks import read_landmarks
 from nsm.surfaces.loading import load_mesh
 
 TINY = [
     "experiment=quick",
+    "surface.parameterization=tutte",
     "trainer.max_steps=2",
     "encoding.resolutions=[4]",
     "data.held_out=64",
@@ -94,8 +97,64 @@ def test_a_checkpoint_cannot_swell(copy, here):
     assert here(f"resume={copy}").returncode == 2
 
 
-def test_a_checkpoint_of_ours_is_not_compressed(finished):
+class Made:
+    """Pickled, it is what a function makes of a number, when it is loaded."""
+
+    def __init__(self, make, size: int) -> None:
+        self.make, self.size = make, size
+
+    def __reduce__(self):
+        return self.make, (self.size,)
+
+
+def test_a_checkpoint_makes_no_room_by_a_number(copy, here):
+    """torch's own safe reading would take two gigabytes for these few bytes."""
+    torch.save({"global_step": 1, "callbacks": Made(bytearray, 2 * 10**9)}, copy / "last.ckpt")
+    assert (copy / "last.ckpt").stat().st_size < 10_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result = here(f"resume={copy}")
+    assert result.returncode == 2 and "last.ckpt" in result.stderr
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 400_000  # kB
+
+
+def test_a_checkpoint_of_ours_is_read(finished):
     check_stored(finished / "last.ckpt")
+
+
+def test_pipes_are_not_waited_for(copy):
+    (copy / "surface.safetensors").unlink()
+    os.mkfifo(copy / "surface.safetensors")
+    with pytest.raises(NsmError, match="not a regular file"):
+        nsm.load(copy)
+    os.mkfifo(copy / "marks.vts")
+    with pytest.raises(NsmError, match="not a regular file"):
+        read_landmarks(copy / "marks.vts")
+
+
+def test_only_the_user_can_name_a_module(here, tmp_path, monkeypatch):
+    """NSM_PLUGINS is the one way to let the command import code; no setting is."""
+    (tmp_path / "mine_for_test.py").write_text(
+        "import nsm\nnsm.register_activation('halved', lambda z: z / 2)\n"
+    )
+    words = ["surface=cone", *TINY, "activation=halved"]
+    refused = here(*words)
+    assert refused.returncode == 2 and "halved" in refused.stderr
+    monkeypatch.setenv("NSM_PLUGINS", "not_there")
+    missing = here(*words)
+    assert missing.returncode == 2 and len(missing.stderr.strip().splitlines()) == 1
+    assert "not_there" in missing.stderr
+    monkeypatch.setenv("NSM_PLUGINS", "mine_for_test")
+    before = dict(ACTIVATIONS)
+    try:
+        assert here(*words, "hydra.run.dir=run").returncode == 0
+        assert json.loads((tmp_path / "run/surface.json").read_text())["map"]["activation"] == {
+            "name": "halved"
+        }
+        target = here("surface=cone", *TINY, "+activation._target_=os.system")
+        assert target.returncode == 2 and "_target_" in target.stderr
+    finally:
+        ACTIVATIONS.clear()
+        ACTIVATIONS.update(before)
 
 
 @pytest.mark.parametrize(
@@ -232,15 +291,15 @@ def test_a_pipe_is_not_waited_for(tmp_path):
 def test_an_array_that_lies_makes_no_room(tmp_path):
     from nsm.pipeline.attributes import read_attributes
 
-    surface = nsm.Surface.load("cone", cache=False)
+    rows = [1801, 1801]
     head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**45},), }}".ljust(117) + "\n"
     data = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head.encode()
     files = {"lies.npy": data, "trap.npy": pickle.dumps(Trap(tmp_path / "sprung"))}
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(NsmError, match="attributes.source"):
-            read_attributes({"source": str(tmp_path / name), "target": None}, surface, surface)
+            read_attributes({"source": str(tmp_path / name), "target": None}, rows)
     assert not (tmp_path / "sprung").exists()
     np.savez(tmp_path / "many.npz", a=np.zeros(3))
     with pytest.raises(NsmError, match="archive"):
-        read_attributes({"source": str(tmp_path / "many.npz"), "target": None}, surface, surface)
+        read_attributes({"source": str(tmp_path / "many.npz"), "target": None}, rows)

@@ -3,10 +3,10 @@
 Each case runs ``nsm`` in a process (forked from one that has imported the libraries, so that 250 of
 them take minutes instead of hours) and folder of its own, within limits of time and memory, and
 must end in a result that is right (:mod:`torture.check`) or in one line on stderr with status 2 and
-nothing left behind. Prints a table, and writes benchmarks/results/torture.json; status 1 if any
-case failed.
+nothing left behind. Keeps what came of each in benchmarks/results/torture.json, prints a table, and
+writes it into docs/robustness.md once every case is there; status 1 if any case failed.
 
-    python benchmarks/torture [--only WORD ...] [--jobs N]
+    python benchmarks/torture [--only WORD ...] [--skip WORD ...] [--jobs N]
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,12 +30,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import nsm.pipeline  # noqa: F401  imported once, for all processes
 from nsm import cli
+from nsm.pipeline.alone import LOCK_FILE
 from torture import check
 from torture.cases import BARE, OVERFIT, Case, all_cases, limits, may_mount
 from torture.shapes import REFUSED, SOLVED
 
 RESULT = Path(__file__).parents[1] / "results" / "torture.json"
-SECONDS = 300  # a case
+PAGE = Path(__file__).parents[2] / "docs" / "robustness.md"
+SECONDS = 300  # of a processor, a case
+SLACK = 5  # times these, on a machine that is busy: then it hangs
 SECONDS_OF_MILLION = 1200
 MEMORY = 6 * 2**30  # bytes of address space
 SHARED = {
@@ -68,19 +71,19 @@ class Trial:
         self.started = time.monotonic()
         self.process = os.fork()
         if self.process == 0:
-            _be_the_command(self.case, words, self.folder, self.said.fileno(), self.told.fileno())
+            _be_the_command(self, words)
 
     def result(self) -> dict[str, Any] | None:
         """What came of it; None while it runs."""
-        done, status = os.waitpid(self.process, os.WNOHANG)
+        done, status, used = os.wait4(self.process, os.WNOHANG)
         spent = time.monotonic() - self.started
-        if not done and spent < self.seconds:
+        if not done and spent < SLACK * self.seconds:
             return None
         case = self.case
         if not done:
             os.kill(self.process, signal.SIGKILL)
-            os.waitpid(self.process, 0)
-            outcome, reason, complaints = FAILED, "", [f"not done within {self.seconds} s"]
+            used = os.wait4(self.process, 0)[2]
+            outcome, reason, complaints = FAILED, "", [f"not done after {spent:.0f} s"]
         else:
             for stream in (self.told, self.said):
                 stream.seek(0)
@@ -100,19 +103,22 @@ class Trial:
             "outcome": FAILED if complaints else outcome,
             "reason": reason,
             "seconds": round(spent, 1),
+            "cpu_seconds": round(used.ru_utime + used.ru_stime, 1),
             "complaints": complaints,
         }
 
 
-def _be_the_command(case: Case, words: Sequence[str], folder: Path, out: int, err: int) -> NoReturn:
-    """Become ``nsm WORDS``, in a folder and within limits; never come back."""
-    os.dup2(out, 1)
-    os.dup2(err, 2)
+def _be_the_command(trial: Trial, words: Sequence[str]) -> NoReturn:
+    """Become ``nsm WORDS``, in the trial's folder and within its limits; never come back."""
+    os.dup2(trial.said.fileno(), 1)
+    os.dup2(trial.told.fileno(), 2)
+    # whoever forked may have put others in their place
+    sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
     status = 1
     try:
-        os.chdir(folder)
-        os.environ.update({"NSM_CACHE": "cache", **case.environment})
-        limits(MEMORY, case.limit)
+        os.chdir(trial.folder)
+        os.environ.update({"NSM_CACHE": "cache", **trial.case.environment})
+        limits(MEMORY, trial.seconds, trial.case.limit)
         sys.argv = ["nsm", *words]
         try:
             cli.main()
@@ -145,7 +151,9 @@ def _judged(
             return SOLVED, "", [*complaints, f"{len(runs)} finished runs"]
         mesh = case.mesh() if case.mesh else None
         return SOLVED, "", complaints + check.complaints(runs[0], case.task, mesh)
-    if status != 2:
+    if status == -signal.SIGXCPU:
+        complaints.append("not done within its limit of processor time")
+    elif status != 2:
         complaints.append(f"status {status}")
     if len(lines) != 1 or not lines[0].startswith("nsm: "):
         complaints.append(f"{len(lines)} lines on stderr: {lines[-1:]}")
@@ -161,7 +169,7 @@ def _is_result(file: Path) -> bool:
     A training that was under way when the disk became full keeps its settings and its checkpoint,
     to go on from.
     """
-    kept = file.name in ("config.yaml", "last.ckpt") or "tensorboard" in file.parts
+    kept = file.name in ("config.yaml", "last.ckpt", LOCK_FILE) or "tensorboard" in file.parts
     return "cache" not in file.parts and not kept
 
 
@@ -203,35 +211,65 @@ def reasons(results: Sequence[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="*", help="words, one of which a case's name must have")
+    parser.add_argument("--skip", nargs="*", default=(), help="words that no case's name may have")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--meshes", type=Path, default=Path("../shared/meshes"))
     options = parser.parse_args()
     mounts = may_mount()
-    todo = [
+    every = [
         (case, SECONDS_OF_MILLION if "million" in case.name else SECONDS)
         for case in all_cases()
         if mounts or case.around is None
     ]
-    todo += _shared(options.meshes.resolve())
-    if options.only:
-        todo = [(c, s) for c, s in todo if any(w in f"{c.group}: {c.name}" for w in options.only)]
+    every += _shared(options.meshes.resolve())
+    chosen = [
+        (case, seconds)
+        for case, seconds in every
+        if (not options.only or _has_one(case, options.only)) and not _has_one(case, options.skip)
+    ]
+    kept = _kept()
+    failed = []
+    for result in _tried(chosen, options.jobs):
+        print(_line(result), flush=True)
+        kept[result["group"], result["case"]] = result
+        if result["outcome"] == FAILED:
+            failed.append(result)
+        _keep(kept, mounts)
 
-    results: dict[int, dict[str, Any]] = {}
-    running: dict[int, Trial] = {}
-    queue = list(enumerate(todo))[::-1]
+    names = [(case.group, case.name) for case, _ in every]
+    missing = [name for name in names if name not in kept]
+    # those of another machine, with meshes that are not at hand here, stand behind
+    ordered = {name: kept[name] for name in [*names, *kept] if name in kept}
+    results = list(ordered.values())
+    _keep(ordered, mounts)
+    print("\n" + table(results))
+    for result in failed:
+        print(f"failed: {_line(result)}")
+    if missing:
+        print(f"{len(missing)} cases have not been tried yet")
+    else:
+        RESULT.with_suffix(".md").write_text(f"{table(results)}\n\n{reasons(results)}\n")
+        _show(table(results))
+    sys.exit(1 if failed else 0)
+
+
+def _has_one(case: Case, words: Sequence[str]) -> bool:
+    return any(word in f"{case.group}: {case.name}" for word in words)
+
+
+def _tried(todo: Sequence[tuple[Case, int]], jobs: int) -> Iterator[dict[str, Any]]:
+    """Run cases, so many at a time, and give what came of each."""
+    queue = list(todo)[::-1]
+    running: list[Trial] = []
     while queue or running:
-        while queue and len(running) < options.jobs:
-            k, (case, seconds) = queue.pop()
-            running[k] = Trial(case, seconds)
-        for k, trial in list(running.items()):
+        while queue and len(running) < jobs:
+            running.append(Trial(*queue.pop()))
+        for trial in list(running):
             result = trial.result()
             if result is not None:
-                results[k] = result
-                del running[k]
-                print(_line(result), flush=True)
+                running.remove(trial)
+                yield result
         time.sleep(0.02)
-    listed = [results[k] for k in sorted(results)]
-    _finish(listed, mounts, whole=not options.only)
 
 
 def _line(result: dict[str, Any]) -> str:
@@ -240,26 +278,31 @@ def _line(result: dict[str, Any]) -> str:
     return f"{result['outcome']:8} {result['seconds']:6.1f} s  {name}  {end}".rstrip()
 
 
-def _finish(results: Sequence[dict[str, Any]], mounts: bool, *, whole: bool) -> None:
-    """Print the table, write the files if it is the whole of it, and end the process."""
-    print("\n" + table(results))
-    failed = [r for r in results if r["outcome"] == FAILED]
-    for r in failed:
-        print(f"failed: {r['group']}: {r['case']}: {'; '.join(r['complaints'])}")
-    if whole:
-        words = {
-            "limits": {
-                "seconds": SECONDS,
-                "seconds_of_a_million_faces": SECONDS_OF_MILLION,
-                "bytes_of_memory": MEMORY,
-            },
-            "disks_mounted": mounts,
-            "cases": results,
-        }
-        text = json.dumps(words, indent=1, ensure_ascii=False)
-        RESULT.write_text(text + "\n")
-        RESULT.with_suffix(".md").write_text(f"{table(results)}\n\n{reasons(results)}\n")
-    sys.exit(1 if failed else 0)
+def _kept() -> dict[tuple[str, str], dict[str, Any]]:
+    """What came of cases before, by group and name."""
+    if not RESULT.exists():
+        return {}
+    return {(r["group"], r["case"]): r for r in json.loads(RESULT.read_text())["cases"]}
+
+
+def _keep(results: Mapping[tuple[str, str], dict[str, Any]], mounts: bool) -> None:
+    words = {
+        "limits": {
+            "seconds": SECONDS,
+            "seconds_of_a_million_faces": SECONDS_OF_MILLION,
+            "bytes_of_memory": MEMORY,
+        },
+        "disks_mounted": mounts,
+        "cases": list(results.values()),
+    }
+    RESULT.write_text(json.dumps(words, indent=1, ensure_ascii=False) + "\n")
+
+
+def _show(text: str) -> None:
+    """Put the table into its place in the documentation."""
+    before, mark, rest = PAGE.read_text().partition("<!-- table -->\n")
+    after = rest.partition("<!-- end -->")[1:]
+    PAGE.write_text(before + mark + "\n" + text + "\n\n" + "".join(after))
 
 
 if __name__ == "__main__":

@@ -3,37 +3,45 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nsm.errors import NsmError
-from nsm.results import SurfaceMap, atomic_write, on_cut_mesh
-from nsm.surfaces import Surface
+from nsm.results import SurfaceMap, atomic_write
+from nsm.results.points import as_values
 
 
-def read_attributes(
-    settings: dict[str, Any], source: Surface, target: Surface
-) -> dict[str, np.ndarray]:
+def read_attributes(settings: dict[str, Any], rows: Sequence[int]) -> dict[str, np.ndarray]:
     """The arrays of ``attributes.source`` and ``attributes.target``, by these words.
 
     Each is a .npy file with a row for each vertex of its mesh file.
+
+    Args:
+        settings: the group ``attributes``.
+        rows: how many vertices the two mesh files have.
 
     Raises:
         NsmError: a file that is no such array.
     """
     result = {}
-    for key, surface in (("source", source), ("target", target)):
+    for key, count in zip(("source", "target"), rows, strict=True):
         if settings[key] is None:
             continue
         try:
+            if not Path(settings[key]).is_file():  # a pipe would be waited for
+                raise ValueError("no such file")
             # mapped, so that a header that lies about the size makes no room for it
             values = np.load(settings[key], mmap_mode="r", allow_pickle=False)
             if not isinstance(values, np.ndarray):
                 raise ValueError("an archive of arrays")
-            on_cut_mesh(surface, values)
-        except (OSError, ValueError, EOFError, OverflowError, SyntaxError) as error:
+            as_values(values, "its values")
+            if values.ndim == 0 or len(values) < count:
+                given = values.shape[0] if values.ndim else 0
+                raise ValueError(f"the mesh has {count} vertices, but {given} rows are in it")
+        except (OSError, ValueError, EOFError, OverflowError, SyntaxError, NsmError) as error:
             reason = " ".join(str(error).split())[:160]
             raise NsmError(
                 f"attributes.{key}={settings[key]}: {reason}; give a .npy array with a row for "

@@ -134,8 +134,9 @@ def fitted(
     settings = config.trainer
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
+    faults = Faults(console)
     callbacks: list[Callback] = [
-        Faults(console),
+        faults,
         GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window),
         AtomicCheckpoint(folder / CHECKPOINT_FILE),
     ]
@@ -177,7 +178,7 @@ def fitted(
     atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
     # killed before the first checkpoint, a run starts again from its beginning
     checkpoint = folder / CHECKPOINT_FILE if resuming else None
-    first_step = _step_of(checkpoint) if checkpoint and checkpoint.is_file() else 0
+    first_step = step_of(checkpoint) if checkpoint and checkpoint.is_file() else 0
     if not first_step:
         checkpoint = None
     logged = plain(config)["logger"]
@@ -199,6 +200,10 @@ def fitted(
     except SystemExit:  # what Lightning makes of an interrupt
         if not trainer.interrupted:
             raise
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
+        if checkpoint is None or faults.begun:
+            raise
+        raise _no_checkpoint(checkpoint) from error  # of another network, or forged
     finally:
         # results are measured in full precision
         torch.set_float32_matmul_precision(before)
@@ -231,15 +236,21 @@ def quiet_lightning() -> None:
     warnings.filterwarnings("ignore", module="lightning_fabric")
 
 
-def _step_of(checkpoint: Path) -> int:
-    """How many steps the training of a checkpoint has made."""
+def step_of(checkpoint: Path) -> int:
+    """How many steps the training of a checkpoint has made.
+
+    Raises:
+        NsmError: a file that is damaged, foreign, or that would call or swell.
+    """
     try:
         check_stored(checkpoint)
         return int(torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"])
     except Exception as error:  # whatever a damaged or foreign file raises
-        raise NsmError(
-            f"{checkpoint}: damaged, or not a checkpoint of nsm; delete it to start again"
-        ) from error
+        raise _no_checkpoint(checkpoint) from error
+
+
+def _no_checkpoint(file: Path) -> NsmError:
+    return NsmError(f"{file}: damaged, or not a checkpoint of this run; delete it to start again")
 
 
 def write_figures(

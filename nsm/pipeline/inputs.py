@@ -19,8 +19,10 @@ from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.surfaces import Surface
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.landmarks import (
+    Landmarks,
     as_vertices,
     check_equal_lengths,
+    listed,
     read_collection,
     read_landmarks,
     read_pairs,
@@ -47,6 +49,11 @@ def read_shape(given: Any, domain: str, key: str) -> Shape:
         raise NsmError(f"setting {key}: give a mesh file, a catalogue name or a run folder")
     if isinstance(given, dict):
         return analytic_surface(given, domain)
+    if not isinstance(given, (NeuralSurface, str, Path)):
+        raise NsmError(
+            f"setting {key}: a {type(given).__name__} is no surface; give a neural surface, a mesh "
+            "file, a catalogue name or a run folder"
+        )
     if isinstance(given, NeuralSurface):
         ready = given
     else:
@@ -68,6 +75,13 @@ def read_shape(given: Any, domain: str, key: str) -> Shape:
     return ready
 
 
+def vertex_count(shape: Shape) -> int:
+    """How many vertices the mesh file of a shape has, up to the last that is on its surface."""
+    if isinstance(shape, Mesh):
+        return int(shape.faces.max()) + 1
+    return int(shape.surface.source_vertex.max()) + 1
+
+
 def landmark_vertices(given: Any, shapes: Sequence[Shape]) -> list[np.ndarray]:
     """Landmarks as vertices (L,) of each shape's mesh file.
 
@@ -80,8 +94,12 @@ def landmark_vertices(given: Any, shapes: Sequence[Shape]) -> list[np.ndarray]:
         NsmError: a file that cannot be read, a landmark that is not on its shape, or given twice,
             or lists of different lengths.
     """
-    lists = _lists(given, len(shapes))
-    check_equal_lengths([_name(s) for s in shapes], lists)
+    names = [_name(shape) for shape in shapes]
+    lists = [
+        listed(item, f"landmarks of {name}")
+        for item, name in zip(_lists(given, len(shapes)), names, strict=True)
+    ]
+    check_equal_lengths(names, lists)
     return [_vertices(list_, shape) for list_, shape in zip(lists, shapes, strict=True)]
 
 
@@ -96,13 +114,22 @@ def _lists(given: Any, count: int) -> list[Any]:
         except KeyError as error:
             raise NsmError(f"landmarks: {error} is missing beside the other list") from None
     else:
-        lists = list(given)
+        lists = list(given) if isinstance(given, (list, tuple)) else _rows(given)
         if count == 2 and lists and all(_is_pair(item) for item in lists):
             lists = [[pair[0] for pair in lists], [pair[1] for pair in lists]]
         lists = [read_landmarks(x) if isinstance(x, (str, Path)) else x for x in lists]
+    if not lists:  # as good as None
+        return [[] for _ in range(count)]
     if len(lists) != count:
         raise NsmError(f"landmarks: {len(lists)} lists for {count} surfaces; give one for each")
     return lists
+
+
+def _rows(given: Any) -> list[Any]:
+    """The rows of an array of landmarks, for example of pairs (L, 2)."""
+    if not isinstance(given, np.ndarray) or given.ndim == 0:
+        raise NsmError("landmarks: neither lists of landmarks nor files")
+    return list(given)
 
 
 def _is_pair(item: Any) -> bool:
@@ -111,20 +138,20 @@ def _is_pair(item: Any) -> bool:
     Two lists of two vertices each would look the same; as two pairs they say more often what is
     meant, as pairs are what the documentation shows.
     """
-    return not isinstance(item, (str, Path)) and len(item) == 2
+    return isinstance(item, (list, tuple, np.ndarray)) and len(item) == 2
 
 
 def _name(shape: Shape) -> str:
     return shape.name if isinstance(shape, Mesh) else shape.surface.name
 
 
-def _vertices(given: Any, shape: Shape) -> np.ndarray:
+def _vertices(given: Landmarks, shape: Shape) -> np.ndarray:
     if len(given) == 0:
         return np.zeros(0, dtype=np.int64)
     if isinstance(shape, Mesh):
         return as_vertices(given, shape.vertices, shape.name)
     surface = shape.surface
-    if np.ndim(given[0]) == 0:
+    if isinstance(given, list):
         surface.preimages(given)  # tells which one is not there
         places = {int(v): k for k, v in enumerate(surface.source_vertex)}
         as_vertices([places[int(v)] for v in given], surface.vertices, surface.name)

@@ -17,7 +17,7 @@ from rich.console import Console
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.common import built, frozen, plain, train, with_map, write_figures
 from nsm.pipeline.guarantee import guaranteed
-from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
+from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape, vertex_count
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
@@ -74,8 +74,8 @@ def run_pair_map(
         for key, given in (("source", source), ("target", target))
     ]
     ids = landmark_vertices(settings["landmarks"] if landmarks is None else landmarks, shapes)
+    attributes = read_attributes(settings["attributes"], [vertex_count(s) for s in shapes])
     phi, psi = neural_surfaces(config, shapes, ids, console)
-    attributes = read_attributes(settings["attributes"], phi.surface, psi.surface)
     matched = matched_landmarks([phi.surface, psi.surface], ids)
     module = build_pair_map(config, phi, psi, matched)
     points, targets = matched.points

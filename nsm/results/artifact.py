@@ -15,6 +15,7 @@ from nsm.maps import ANALYTIC, build_analytic, build_map
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
+from nsm.results.points import as_points, check_points
 from nsm.surfaces import Surface
 
 FORMAT = "nsm-surface"
@@ -45,23 +46,32 @@ class NeuralSurface:
     @overload
     def __call__(self, uv: Tensor) -> Tensor: ...
     def __call__(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
-        """Points (N, 2) of Ω to points (N, 3) of the surface; numpy for numpy, torch for torch."""
+        """Points (N, 2) of Ω to points (N, 3) of the surface; numpy for numpy, torch for torch.
+
+        Raises:
+            NsmError: another shape; in arrays also NaN or infinity.
+        """
         if isinstance(uv, Tensor):
             return self.map(self._fit(uv)).to(uv.dtype)
-        return evaluate(self.map, np.asarray(uv))
+        return evaluate(self.map, as_points(uv, 2, "points of the domain"))
 
     @overload
     def jacobian(self, uv: np.ndarray) -> np.ndarray: ...
     @overload
     def jacobian(self, uv: Tensor) -> Tensor: ...
     def jacobian(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
-        """Jacobians (N, 3, 2) at points (N, 2) of Ω."""
+        """Jacobians (N, 3, 2) at points (N, 2) of Ω.
+
+        Raises:
+            NsmError: as :meth:`__call__`.
+        """
         if isinstance(uv, Tensor):
             return self.map.value_and_jacobian(self._fit(uv))[1].to(uv.dtype)  # type: ignore[operator]
-        return evaluate_jacobian(self.map, np.asarray(uv))[1]
+        return evaluate_jacobian(self.map, as_points(uv, 2, "points of the domain"))[1]
 
     def _fit(self, uv: Tensor) -> Tensor:
         """Points in the type of the network's weights; the caller's type is given back."""
+        check_points(uv, "points of the domain")
         weight = next(self.map.parameters(), None)
         return uv if weight is None else uv.to(weight.dtype)
 
@@ -70,7 +80,12 @@ class NeuralSurface:
         return self(self.surface.uv), self.surface.faces, self.surface.uv
 
     def in_original_units(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the surface in the units and place of the mesh file."""
+        """Points (N, 3) of the surface in the units and place of the mesh file.
+
+        Raises:
+            NsmError: another shape, NaN or infinity.
+        """
+        points = as_points(points, 3, "points of the surface")
         return points / self.surface.scale + self.surface.center
 
     def save(self, folder: str | Path) -> None:

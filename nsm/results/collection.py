@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from nsm.errors import NsmError
 from nsm.maps import Between
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, together
@@ -54,7 +55,14 @@ class SurfaceCollection:
         return len(self.surfaces)
 
     def pair(self, source: int, target: int) -> SurfaceMap:
-        """The map F_{source→target}: points, transfer and morph from any surface to any other."""
+        """The map F_{source→target}: points, transfer and morph from any surface to any other.
+
+        Raises:
+            NsmError: a number that no surface has.
+        """
+        for number in (source, target):
+            if number not in range(len(self)):
+                raise NsmError(f"surface {number!r} is not one of 0 to {len(self) - 1}")
         if (source, target) not in self._made:
             self._made[source, target] = self._pair(source, target)
         return self._made[source, target]

@@ -30,15 +30,20 @@ class Faults(Callback):
         console: where each fault is told, in one line.
 
     Attributes:
+        begun: whether training has begun, with all that is in a checkpoint taken up.
         rollbacks: {step, back_to} of each, for metrics.json.
     """
 
     def __init__(self, console: Console) -> None:
         self.console = console
+        self.begun = False
         self.good: dict[str, Any] | None = None
         self.rollbacks: list[dict[str, int]] = []
         self.loss: Tensor | None = None
         self.parts = 1
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.begun = True
 
     def on_before_backward(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, loss: Tensor

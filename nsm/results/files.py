@@ -10,6 +10,8 @@ import hashlib
 import json
 import math
 import os
+import pickletools
+import re
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -34,6 +36,13 @@ BROKEN = (
     MemoryError,
     NsmError,
 )
+
+
+# what the pickle of a checkpoint may call, and all of pickle's ways to name something
+_CALLED = re.compile(
+    r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch (\w+Storage|Size)"
+)
+_NAMING = ("GLOBAL", "STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4")
 
 
 def atomic_write(path: str | Path, data: bytes) -> None:
@@ -156,10 +165,21 @@ def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], d
 
 
 def check_stored(archive: Path) -> None:
-    """ValueError unless a zip archive keeps its members as they are, so that it cannot swell."""
+    """ValueError for a checkpoint that may take more memory than its size.
+
+    Its members must be stored as they are, and it must be made of tensors and plain values:
+    what is called while it is read makes no room by numbers that are in it.
+    """
     with zipfile.ZipFile(archive) as members:
-        if any(member.compress_type != zipfile.ZIP_STORED for member in members.infolist()):
-            raise ValueError("compressed members")
+        for member in members.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise ValueError("compressed members")
+            if not member.filename.endswith(".pkl"):
+                continue
+            for code, argument, _ in pickletools.genops(members.read(member)):
+                named = code.name in _NAMING
+                if named and not (code.name == "GLOBAL" and _CALLED.fullmatch(str(argument))):
+                    raise ValueError(f"{argument} is nothing that a checkpoint needs")
 
 
 def misfit(stem: Path, error: Exception) -> NsmError:
@@ -171,6 +191,8 @@ def misfit(stem: Path, error: Exception) -> NsmError:
 
 
 def _read(file: Path) -> bytes:
+    if file.exists() and not file.is_file():  # a pipe would be waited for, a device read for ever
+        raise NsmError(f"{file}: not a regular file; give the folder of a complete run")
     try:
         return file.read_bytes()
     except OSError as error:

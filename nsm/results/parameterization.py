@@ -15,6 +15,7 @@ from nsm.results.certificate import Correction, certificate, mended
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
+from nsm.results.points import as_points
 from nsm.surfaces.location import locate
 
 FORMAT = "nsm-parameterization"
@@ -42,9 +43,14 @@ class Parameterization:
     correction: Correction = field(default_factory=Correction)
 
     def __call__(self, uv: np.ndarray) -> np.ndarray:
-        """Points (N, 2) of Ω to the plane (N, 2); linear on each triangle of the mesh."""
+        """Points (N, 2) of Ω to the plane (N, 2); linear on each triangle of the mesh.
+
+        Raises:
+            NsmError: another shape, NaN or infinity.
+        """
         s = self.phi.surface
-        return locate(np.asarray(uv), s.uv, s.faces).take(self.uv, s.faces)
+        uv = as_points(uv, 2, "points of the domain")
+        return locate(uv, s.uv, s.faces).take(self.uv, s.faces)
 
     @cached_property
     def uv(self) -> np.ndarray:

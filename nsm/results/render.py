@@ -89,7 +89,7 @@ def _covered(
     area = _cross(b - a, c - a)
     with np.errstate(divide="ignore", invalid="ignore"):
         w1, w2 = _cross(p - a, c - a) / area, _cross(b - a, p - a) / area
-    w0 = 1 - w1 - w2
+        w0 = 1 - w1 - w2
     inside = (w0 >= 0) & (w1 >= 0) & (w2 >= 0)  # false for NaN: triangles seen edge-on
     inside &= ((place >= 0) & (place < size)).all(axis=-1)
     i, j = np.nonzero(inside)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +13,14 @@ import numpy as np
 import torch
 from torch import nn
 
+from nsm.errors import NsmError
 from nsm.maps import Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, mended
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
+from nsm.results.points import as_points, as_values
 from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 
@@ -54,15 +58,25 @@ class SurfaceMap:
         """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.
 
         Points off the source start from the nearest point on it.
+
+        Raises:
+            NsmError: another shape, NaN or infinity.
         """
         s, t = self.source.surface, self.target.surface
-        normalised = (np.asarray(points, dtype=np.float64) - s.center) * s.scale
+        points = as_points(points, 3, "points on the source")
+        with np.errstate(over="ignore"):  # what is far beyond all is answered as well
+            normalised = (points - s.center) * s.scale
         uv = locate(normalised, s.vertices, s.faces).take(s.uv, s.faces)
         return self.target.in_original_units(_lifted(t, self.planar(uv)))
 
     def planar(self, uv: np.ndarray) -> np.ndarray:
-        """Points (N, 2) of the source's domain to those of the target's, (N, 2)."""
+        """Points (N, 2) of the source's domain to those of the target's, (N, 2).
+
+        Raises:
+            NsmError: another shape, NaN or infinity.
+        """
         s = self.source.surface
+        uv = as_points(uv, 2, "points of the domain")
         return locate(uv, s.uv, s.faces).take(self.image_uv, s.faces)
 
     @cached_property
@@ -117,13 +131,13 @@ class SurfaceMap:
             (W, ...) a row for each vertex of the other mesh file (see :func:`by_file_vertex`).
 
         Raises:
-            ValueError: too few rows for the mesh.
+            NsmError: too few rows for the mesh, or other values than finite numbers.
         """
         start, end = self.source.surface, self.target.surface
         places = self._back
         if back:
             start, end, places = end, start, self._forth
-        inner = on_cut_mesh(start, np.asarray(values))
+        inner = on_cut_mesh(start, as_values(values, "values to transfer"))
         if np.issubdtype(inner.dtype, np.integer) or inner.dtype == bool:
             best = places.weights.argmax(axis=1)
             moved = inner[start.faces[places.face, best]]
@@ -135,7 +149,12 @@ class SurfaceMap:
         """Vertices (V, 3) on the straight way from the source (t = 0) to the target (t = 1).
 
         Normalised units; the target is first turned and moved to lie best on the source.
+
+        Raises:
+            NsmError: t is not a finite number.
         """
+        if not isinstance(t, Real) or not math.isfinite(t):
+            raise NsmError(f"morph: {t!r} is not a number from 0 to 1")
         return (1 - t) * self.source.surface.vertices + t * self.aligned_image
 
     @cached_property
@@ -144,7 +163,12 @@ class SurfaceMap:
         return self.aligned(self.image)
 
     def aligned(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) near the target, normalised, under that rigid motion (Kabsch)."""
+        """Points (N, 3) near the target, normalised, under that rigid motion (Kabsch).
+
+        Raises:
+            NsmError: another shape, NaN or infinity.
+        """
+        points = as_points(points, 3, "points near the target")
         image, reference = self.image, self.source.surface.vertices
         p, q = image.mean(axis=0), reference.mean(axis=0)
         u, _, vt = np.linalg.svd((image - p).T @ (reference - q))
@@ -214,11 +238,14 @@ def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
     """Values at the mesh file's vertices (W, ...) as values at the cut mesh's (V, ...).
 
     Vertices that were inserted between others get what these have: the mean, or a label.
+
+    Raises:
+        NsmError: too few rows for the mesh.
     """
     needed = int(surface.source_vertex.max()) + 1
     if values.ndim == 0 or len(values) < needed:
         rows = 0 if values.ndim == 0 else len(values)
-        raise ValueError(f"{surface.name} has {needed} vertices, but {rows} rows were given")
+        raise NsmError(f"{surface.name} has {needed} vertices, but {rows} rows were given")
     result = values[np.maximum(surface.source_vertex, 0)]
     inserted = np.flatnonzero(surface.source_vertex < 0)
     whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool

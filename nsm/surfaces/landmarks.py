@@ -31,7 +31,7 @@ def read_landmarks(path: str | Path) -> Landmarks:
     if file.suffix.lower() not in _ENDINGS:
         raise NsmError(f"{file}: landmarks are read from {', '.join(_ENDINGS)} files")
     if file.suffix.lower() == ".json":
-        return _listed(_json(file), str(file))
+        return listed(_json(file), str(file))
     result = []
     for number, line in enumerate(_text(file).splitlines(), start=1):
         words = line.split()
@@ -61,7 +61,7 @@ def read_pairs(path: str | Path) -> tuple[Landmarks, Landmarks]:
     file = Path(path)
     words = _json(file)
     if isinstance(words, dict) and {"source", "target"} <= set(words):
-        return _listed(words["source"], f"{file}, source"), _listed(
+        return listed(words["source"], f"{file}, source"), listed(
             words["target"], f"{file}, target"
         )
     pairs = words.get("pairs") if isinstance(words, dict) else words
@@ -70,7 +70,7 @@ def read_pairs(path: str | Path) -> tuple[Landmarks, Landmarks]:
             f'{file}: neither {{"source": [...], "target": [...]}} nor a list of pairs; '
             "give one of these"
         )
-    return _listed([p[0] for p in pairs], str(file)), _listed([p[1] for p in pairs], str(file))
+    return listed([p[0] for p in pairs], str(file)), listed([p[1] for p in pairs], str(file))
 
 
 def read_collection(path: str | Path) -> list[Landmarks]:
@@ -84,7 +84,7 @@ def read_collection(path: str | Path) -> list[Landmarks]:
     lists = words.get("landmarks") if isinstance(words, dict) else words
     if not isinstance(lists, list):
         raise NsmError(f"{file}: not a list of lists of landmarks; give one for each surface")
-    return [_listed(item, f"{file}, list {k}") for k, item in enumerate(lists)]
+    return [listed(item, f"{file}, list {k}") for k, item in enumerate(lists)]
 
 
 def as_vertices(
@@ -97,24 +97,24 @@ def as_vertices(
     Raises:
         NsmError: a number out of range, a point far from the mesh, or a landmark given twice.
     """
-    listed = _listed(landmarks, name)
-    if isinstance(listed, np.ndarray):
-        distance, nearest = cKDTree(vertices).query(listed)
+    given = listed(landmarks, name)
+    if isinstance(given, np.ndarray):
+        distance, nearest = cKDTree(vertices).query(given)
         limit = _FAR * float(np.linalg.norm(np.ptp(vertices, axis=0)))
         for k in np.flatnonzero(distance > limit)[:1].tolist():
             raise NsmError(
-                f"{name}: landmark {k} at {listed[k].tolist()} is {distance[k]:.3g} away from the "
+                f"{name}: landmark {k} at {given[k].tolist()} is {distance[k]:.3g} away from the "
                 "mesh; give a point on it, in the units of its file"
             )
         ids = nearest.astype(np.int64)
     else:
-        for k, vertex in enumerate(listed):
+        for k, vertex in enumerate(given):
             if not 0 <= vertex < len(vertices):
                 raise NsmError(
                     f"{name}: landmark {k} is vertex {vertex}, but the mesh has vertices 0 to "
                     f"{len(vertices) - 1}; give one of these"
                 )
-        ids = np.array(listed, dtype=np.int64)
+        ids = np.array(given, dtype=np.int64)
     seen: dict[int, int] = {}
     for k, vertex in enumerate(ids.tolist()):
         if vertex in seen:
@@ -126,7 +126,7 @@ def as_vertices(
     return ids
 
 
-def check_equal_lengths(names: Sequence[str], lists: Sequence[Sequence[Any] | np.ndarray]) -> None:
+def check_equal_lengths(names: Sequence[str], lists: Sequence[Landmarks]) -> None:
     """NsmError unless all surfaces have as many landmarks."""
     counts = [len(item) for item in lists]
     if len(set(counts)) > 1:
@@ -134,14 +134,19 @@ def check_equal_lengths(names: Sequence[str], lists: Sequence[Sequence[Any] | np
         raise NsmError(f"landmarks: {told}; give each surface the same ones, in the same order")
 
 
-def _listed(given: Any, what: str) -> Landmarks:
+def listed(given: Any, what: str) -> Landmarks:
+    """Landmarks as a list of vertex numbers, or as points (L, 3).
+
+    Raises:
+        NsmError: anything else.
+    """
     if isinstance(given, np.ndarray):
         given = given.tolist()
     given = list(given) if isinstance(given, (list, tuple)) else given
     if not isinstance(given, list):
         raise NsmError(f"{what}: not a list of landmarks")
-    if all(isinstance(x, int) and not isinstance(x, bool) for x in given):
-        return given
+    if all(isinstance(x, (int, np.integer)) and not isinstance(x, bool) for x in given):
+        return [int(x) for x in given]
     try:
         points = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
@@ -161,6 +166,8 @@ def _json(file: Path) -> Any:
 
 def _text(file: Path) -> str:
     try:
+        if file.exists() and not file.is_file():  # a pipe would be waited for
+            raise NsmError(f"{file}: not a regular file; give a list of landmarks")
         if file.stat().st_size > _LARGEST:
             raise NsmError(f"{file}: larger than {_LARGEST // 1_000_000} MB; not a landmark list")
         return file.read_text(encoding="utf-8")

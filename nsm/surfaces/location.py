@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+_FAR = 1e6  # times the size of a mesh
+_LARGEST = 1e300
+
 
 class Places(NamedTuple):
     """Places on a mesh: the face (N,) and barycentric weights (N, 3) of its corners."""
@@ -31,10 +34,27 @@ def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Place
         return np.ascontiguousarray(np.pad(p, ((0, 0), (0, 3 - p.shape[1]))))
 
     mesh = spatial(vertices)
-    _, face, nearest = igl.point_mesh_squared_distance(spatial(points), mesh, faces)
+    near = _near(spatial(points), mesh)
+    _, face, nearest = igl.point_mesh_squared_distance(near, mesh, faces)
     face = np.asarray(face, dtype=np.int64).reshape(-1)
     corners = mesh[faces[face]]
     return Places(face, _barycentric(np.asarray(nearest), corners))
+
+
+def _near(points: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Points (N, 3), those very far from a mesh (V, 3) drawn straight towards its middle.
+
+    What is nearest stays so; the squares of their distances could not be told apart, or be
+    infinite, and libigl would then name a face that is not there.
+    """
+    low, high = mesh.min(axis=0), mesh.max(axis=0)
+    offset = points.clip(-_LARGEST, _LARGEST) - 0.5 * (low + high)
+    limit = _FAR * max(float((high - low).max()), 1e-300)
+    reach = np.abs(offset).max(axis=1, keepdims=True)
+    far = reach[:, 0] > limit
+    result = points.copy()
+    result[far] = 0.5 * (low + high) + offset[far] * (limit / reach[far])
+    return result
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

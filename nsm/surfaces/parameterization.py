@@ -358,7 +358,7 @@ def slide(
         for _ in range(14):
             trial = _move(uv, direction, step, inner, moving, domain)
             value = _energy(gradient, area, faces, trial)
-            if value < energy:
+            if value < energy and _goes_round(trial[loop]):
                 improved = True
                 break
             step *= 0.6
@@ -527,6 +527,14 @@ def _move(
             -1.0, 1.0
         )
     return moved
+
+
+def _goes_round(polygon: np.ndarray) -> bool:
+    """Whether each side of a polygon (B,2) of ∂Ω runs counter-clockwise around the middle of Ω.
+
+    A side over more than half of the circle would leave the middle out.
+    """
+    return bool((_cross(polygon, np.roll(polygon, -1, axis=0)) > 0).all())
 
 
 def signed_areas(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:

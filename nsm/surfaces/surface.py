@@ -17,6 +17,7 @@ from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.cutting import Cut, cut_to_disc
+from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.parameterization import (
     DOMAIN_AREA,
@@ -131,7 +132,7 @@ class Surface:
                 f"use one of {', '.join(METHODS)}"
             )
         vertices, faces = as_arrays(vertices, faces, name)
-        seam = None if seam_vertices is None else [int(v) for v in seam_vertices]
+        seam = None if seam_vertices is None else _numbers(seam_vertices, f"{name}: seam_vertices")
         options = {"domain": domain, "seam": seam, "method": parameterization}
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
@@ -280,13 +281,22 @@ class Surface:
         Raises:
             NsmError: a vertex that the file does not have, or that was removed as bad.
         """
-        result = np.empty((len(vertex_ids), 2))
-        for row, vertex in enumerate(vertex_ids):
-            found = np.flatnonzero(self.source_vertex == int(vertex))
-            if int(vertex) < 0 or len(found) == 0:
+        numbers = _numbers(vertex_ids, f"{self.name}: vertices")
+        result = np.empty((len(numbers), 2))
+        for row, vertex in enumerate(numbers):
+            found = np.flatnonzero(self.source_vertex == vertex)
+            if vertex < 0 or len(found) == 0:
                 raise NsmError(
                     f"{self.name}: vertex {vertex} is not on the surface "
                     f"(0 to {int(self.source_vertex.max())}); give another landmark"
                 )
             result[row] = self.uv[found[0]]
         return result
+
+
+def _numbers(given: Any, what: str) -> list[int]:
+    """Vertex numbers; NsmError for anything else than a list of whole numbers."""
+    numbers = listed(given, what)
+    if not isinstance(numbers, list):
+        raise NsmError(f"{what}: give vertex numbers")
+    return numbers

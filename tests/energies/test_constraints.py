@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from thorough import examples
 
 from nsm.energies import (
     boundary,
@@ -54,7 +55,7 @@ def test_distances_and_terms(domain, p, distance):
 
 
 @pytest.mark.parametrize("domain", DISTANCES)
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(x=st.floats(-3, 3), y=st.floats(-3, 3))
 def test_distance_is_that_to_the_nearest_boundary_point(domain, x, y):
     angle = torch.linspace(0, 2 * math.pi, 2001, dtype=torch.float64)

@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from metric_samples import extreme_metrics, jacobians, metric, with_singular_values
+from thorough import examples
 
 from nsm.energies import ENERGIES, energy
 
@@ -134,7 +135,7 @@ def test_equiareal_conformal_runs_from_angles_to_areas():
 
 
 @pytest.mark.parametrize("name", ENERGIES)
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     seed=st.integers(0, 10**6),
     angle=st.floats(-7, 7),
@@ -152,7 +153,7 @@ def test_frames_of_the_surfaces_do_not_matter(name, seed, angle, reflect, turned
 
 
 @pytest.mark.parametrize("name", ENERGIES)
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     seed=st.integers(0, 10**6),
     angle=st.floats(-7, 7),

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from thorough import examples
 
 from nsm.energies import rotation
 
@@ -21,14 +22,14 @@ def landmarks(n, seed):
     return torch.randn(n, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(angle=ANGLES, n=st.integers(1, 8), seed=st.integers(0, 10**6))
 def test_recovers_a_rotation(angle, n, seed):
     p = landmarks(n, seed)
     torch.testing.assert_close(rotation(p, p @ turn(angle).T), turn(angle), rtol=0, atol=1e-9)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(seed=st.integers(0, 10**6))
 def test_is_the_best_of_all_rotations_and_never_a_reflection(seed):
     p, q = landmarks(4, seed), landmarks(4, seed + 1)

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from thorough import examples
 
 from nsm.errors import NsmError
 from nsm.maps.analytic import ANALYTIC, build_analytic, parse_expression
@@ -234,7 +235,7 @@ def test_graphs_without_finite_values_are_refused(z):
     assert "\n" not in str(caught.value)
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(st.text(alphabet="uvpisncoexqrtlgabh0123456789.+-*/() ,_[]'\"\n", max_size=25))
 def test_any_text_is_a_graph_or_a_plain_refusal(text):
     try:

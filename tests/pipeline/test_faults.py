@@ -250,6 +250,18 @@ def test_an_artefact_written_over_another_is_the_one_or_the_other(tmp_path, call
     ]
 
 
+@pytest.mark.parametrize("part", ["state_dict", "optimizer_states", "loops", "callbacks"])
+def test_a_checkpoint_of_another_make_is_told_in_one_line(surface, tmp_path, part):
+    """As of a stranger, or of a network that has other layers."""
+    run(surface, tmp_path, "trainer.max_steps=10")
+    state = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    state[part] = {name: 3 for name in state[part]} if part == "callbacks" else {"x": 1}
+    torch.save(state, tmp_path / "last.ckpt")
+    with pytest.raises(NsmError, match=r"last\.ckpt: damaged") as error:
+        run(surface, tmp_path, resuming=True)
+    assert "\n" not in str(error.value)
+
+
 # --- full disks --------------------------------------------------------------------------------
 
 

@@ -122,7 +122,7 @@ def test_values_are_carried_over_and_back(made, files):
     labels = (np.asarray(ball.vertices)[:, 0] > 0).astype(int)
     carried = f.transfer(labels)
     assert carried.dtype == labels.dtype and set(np.unique(carried)) == {0, 1}
-    with pytest.raises(ValueError, match="rows"):
+    with pytest.raises(NsmError, match="rows"):
         f.transfer(colours[:10])
 
 

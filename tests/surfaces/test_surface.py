@@ -9,8 +9,9 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from thorough import examples
 
 from nsm.errors import NsmError
 from nsm.surfaces import Surface, cache, catalogue, catalogue_names, topology
@@ -151,7 +152,7 @@ def test_tutte_is_the_uniform_harmonic_map_of_libigl():
     assert np.allclose(ours[inner], expected, atol=1e-9)
 
 
-@settings(max_examples=5, deadline=None)
+@examples(5)
 @given(st.lists(st.floats(-3, 3), min_size=6, max_size=6))
 def test_moving_the_mesh_changes_nothing(numbers):
     x, y = np.meshgrid(np.linspace(0, 2, 12), np.linspace(0, 1, 9), indexing="ij")

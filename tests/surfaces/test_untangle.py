@@ -4,8 +4,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from thorough import examples
 
 from nsm.surfaces.predicates import orientation
 from nsm.surfaces.shapes import grid_mesh, ring_mesh
@@ -25,14 +26,14 @@ def exact(a, b, c):
 
 
 @given(st.lists(finite, min_size=6, max_size=6))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_signs_of_areas_are_exact(x):
     a, b, c = x[:2], x[2:4], x[4:]
     assert orientation([a], [b], [c])[0] == exact(a, b, c)
 
 
 @given(st.integers(-50, 50), st.integers(-50, 50), st.integers(0, 2))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_signs_are_exact_next_to_a_line(i, j, which):
     """Points a few roundings off the diagonal, where the rounded determinant often errs."""
     x = [[0.5 + i * 2.0**-53, 0.5 + j * 2.0**-53], [12.0, 12.0], [24.0, 24.0]]
@@ -56,7 +57,7 @@ def rim_of(uv, faces):
     st.floats(0.02, 0.2),
     st.sampled_from([(DISC, DISC_FACES), (SQUARE, SQUARE_FACES)]),
 )
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_a_tangled_mesh_is_untangled_whatever_the_tangle(seed, share, size, mesh):
     rest, faces = mesh
     random = np.random.default_rng(seed)
@@ -101,7 +102,7 @@ def test_what_cannot_be_untangled_is_given_back_for_the_caller_to_count():
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.15), st.sampled_from(["disc", "square"]))
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_a_boundary_is_put_in_order_along_the_domain(seed, size, domain):
     random = np.random.default_rng(seed)
     t = np.arange(40) / 40

@@ -1,0 +1,619 @@
+"""Every public function and method, tried on whatever it may be given: a right result or NsmError.
+
+``PROPERTIES`` names the tests of each; what is public and has none fails.
+"""
+
+import copy
+import inspect
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pytorch_lightning as pl
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from thorough import examples
+from tiny import NETWORK, planar, results, stirred
+
+import nsm
+from nsm import api, cli, extensions
+from nsm.config import compose_config
+from nsm.energies import ENERGIES, energy
+from nsm.errors import NsmError
+from nsm.maps import (
+    ACTIVATIONS,
+    ANALYTIC,
+    BLOCKS,
+    ENCODINGS,
+    Activation,
+    NeuralMap,
+    build_analytic,
+)
+from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
+from nsm.surfaces import Surface, catalogue_names
+
+NEURAL, FLAT, PAIR, TRIO = results(rings=3)
+VERTICES = len(NEURAL[0].surface.vertices)
+INNER = 19  # vertices that are not on the rim
+
+_DTYPES = st.sampled_from([np.float64, np.float32, np.int32, np.int64, bool, complex, "U2"])
+_SHAPES = arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)
+ANY_ARRAY = arrays.arrays(_DTYPES, _SHAPES)
+ANY_FLOAT = st.floats() | st.sampled_from([0.0, 1e300, -1e300, 1e-300, math.nan, math.inf])
+
+
+def rows_of(columns: int) -> st.SearchStrategy[np.ndarray]:
+    """Arrays (N, columns) of all kinds of floats, small ones more often."""
+    shape = st.tuples(st.integers(0, 5), st.just(columns))
+    return arrays.arrays(np.float64, shape, elements=ANY_FLOAT) | arrays.arrays(
+        np.float64, shape, elements=st.floats(-2, 2)
+    )
+
+
+def usable(array: np.ndarray, columns: int) -> bool:
+    real = array.dtype.kind in "fiub"
+    return real and array.ndim == 2 and array.shape[1] == columns and np.isfinite(array).all()
+
+
+# ------------------------------------------------------------------ results take points
+
+
+def check_points(function: Callable, array: np.ndarray, columns: int, out: tuple[int, ...]) -> None:
+    """Points (N, columns) are answered by finite (N, *out), all else by NsmError."""
+    try:
+        result = function(array)
+    except NsmError as error:
+        assert not usable(array, columns) and "\n" not in str(error)
+        return
+    assert usable(array, columns) and result.shape == (len(array), *out)
+    if np.abs(array, dtype=np.float64).max(initial=0) < 1e30:
+        assert np.isfinite(result).all()
+
+
+@examples(40)
+@given(ANY_ARRAY | rows_of(2))
+def test_functions_of_the_domain(array):
+    check_points(NEURAL[0], array, 2, (3,))
+    check_points(NEURAL[0].jacobian, array, 2, (3, 2))
+    check_points(FLAT, array, 2, (2,))
+    check_points(PAIR.planar, array, 2, (2,))
+
+
+@examples(40)
+@given(ANY_ARRAY | rows_of(3))
+def test_functions_of_space(array):
+    check_points(PAIR, array, 3, (3,))
+    check_points(PAIR.aligned, array, 3, (3,))
+    check_points(NEURAL[0].in_original_units, array, 3, (3,))
+
+
+@examples(30)
+@given(ANY_ARRAY)
+def test_functions_of_tensors(array):
+    if array.dtype.kind == "U":
+        return
+    tensor = torch.from_numpy(array.copy())
+    for function in (NEURAL[0], NEURAL[0].jacobian):
+        try:
+            result = function(tensor)
+        except NsmError:
+            assert tensor.ndim != 2 or tensor.shape[1] != 2 or not tensor.is_floating_point()
+        else:
+            assert result.dtype == tensor.dtype and len(result) == len(tensor)
+
+
+@examples(30)
+@given(
+    arrays.arrays(np.float64, st.tuples(st.integers(1, 8), st.just(2)), elements=st.floats(-1, 1))
+)
+def test_jacobians_are_differences(uv):
+    phi, eps = NEURAL[0], 1e-3
+    step = eps * np.eye(2)
+    slopes = [(phi(uv + step[k]) - phi(uv - step[k])) / (2 * eps) for k in (0, 1)]
+    assert np.allclose(phi.jacobian(uv), np.stack(slopes, axis=2), atol=1e-2)
+
+
+@examples(30)
+@given(
+    arrays.arrays(np.float64, st.tuples(st.integers(1, 8), st.just(2)), elements=st.floats(-1, 1))
+)
+def test_points_keep_to_the_target_and_units_come_back(uv):
+    inside = uv / np.maximum(1, np.linalg.norm(uv, axis=1, keepdims=True))
+    assert (np.linalg.norm(PAIR.planar(inside), axis=1) <= 1 + 1e-9).all()
+    s = NEURAL[0].surface
+    points = NEURAL[0](inside)
+    back = (NEURAL[0].in_original_units(points) - s.center) * s.scale
+    assert np.allclose(back, points, atol=1e-12)
+
+
+@examples(40)
+@given(
+    st.one_of(
+        ANY_ARRAY,
+        arrays.arrays(np.float64, (VERTICES, 2), elements=ANY_FLOAT),
+        arrays.arrays(np.float64, VERTICES, elements=st.floats(-1, 1)),
+        arrays.arrays(np.int64, VERTICES, elements=st.integers(0, 3)),
+    ),
+    st.booleans(),
+)
+def test_transfer(values, back):
+    try:
+        carried = PAIR.transfer(values, back=back)
+    except NsmError:
+        numbers = values.dtype.kind in "fiubc" and np.isfinite(values).all()
+        assert not (numbers and values.ndim and len(values) >= VERTICES)
+        return
+    assert carried.shape == values.shape
+    if carried.size:
+        room = 1e-9 * np.abs(values).max()
+        assert values.min() - room <= carried.min() <= carried.max() <= values.max() + room
+    if values.dtype.kind in "ib":
+        assert set(np.unique(carried)) <= set(np.unique(values)) and carried.dtype == values.dtype
+
+
+@examples(30)
+@given(ANY_FLOAT | st.integers(-2, 2) | st.none() | st.text(max_size=2) | st.complex_numbers())
+def test_morph(t):
+    try:
+        vertices = PAIR.morph(t)
+    except NsmError:
+        assert not isinstance(t, (int, float)) or not math.isfinite(t)
+        return
+    assert vertices.shape == (VERTICES, 3)
+    if t == 0:
+        assert (vertices == PAIR.source.surface.vertices).all()
+
+
+@examples(20)
+@given(*[st.integers(-4, 4) | st.none() | st.floats()] * 2)
+def test_pairs_of_a_collection(i, j):
+    assert len(TRIO) == 3
+    try:
+        f = TRIO.pair(i, j)
+    except NsmError:
+        assert i not in range(3) or j not in range(3)
+        return
+    assert f.source is NEURAL[int(i)] and f.target is NEURAL[int(j)]
+
+
+@examples(3)
+@given(st.integers(0, 10**6))
+def test_what_is_mended_is_certified(seed):
+    """A few vertices are thrown about; the boundary stays."""
+    random = np.random.default_rng(seed)
+    s = NEURAL[0].surface
+    inner = np.flatnonzero(np.linalg.norm(s.uv, axis=1) < 0.99)
+    moved = random.choice(inner, 2, replace=False)
+    image = PAIR.image_uv.copy()
+    image[moved] += random.normal(scale=0.3, size=(2, 2))
+    from nsm.results.certificate import Correction
+
+    correction = Correction.between(PAIR.image_uv, image, Correction())
+    for broken in (
+        SurfaceMap(PAIR.source, PAIR.target, PAIR.map, PAIR.landmarks, correction=correction),
+        Parameterization(NEURAL[0], planar(), correction=correction),
+        SurfaceCollection(NEURAL, TRIO.maps, TRIO.landmarks, corrections={(0, 1): correction}),
+    ):
+        better = broken.mended()
+        assert better.certificate["certified"]
+        assert better.certificate["flipped_triangles"] == 0
+
+
+# ------------------------------------------------------------------ save and load
+
+FIGURES = st.dictionaries(st.text(max_size=5), st.floats(allow_nan=False, allow_infinity=False))
+SETTINGS = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=5,
+)
+
+
+def same_map(a: torch.nn.Module, b: torch.nn.Module) -> None:
+    left, right = a.state_dict(), b.state_dict()
+    assert left.keys() == right.keys()
+    assert all(torch.equal(left[key], right[key]) for key in left)
+
+
+def same_surface(a: NeuralSurface, b: NeuralSurface) -> None:
+    same_map(a.map, b.map)
+    for name in ("vertices", "faces", "uv", "source_vertex", "twins", "center", "scale"):
+        assert np.array_equal(getattr(a.surface, name), getattr(b.surface, name))
+    assert (a.surface.name, a.surface.domain) == (b.surface.name, b.surface.domain)
+
+
+@examples(5)
+@given(FIGURES, st.dictionaries(st.text(max_size=5), SETTINGS, max_size=3), st.data())
+def test_what_is_saved_is_what_is_loaded(tmp_path_factory, figures, config, data):
+    folder = tmp_path_factory.mktemp("saved")
+    network = NeuralMap(out_dim=3, **{**NETWORK, "depth": data.draw(st.integers(0, 2))})
+    neural = NeuralSurface(NEURAL[0].surface, stirred(network), figures, config)
+    flat = Parameterization(neural, FLAT.map, {"nsm": figures}, config)
+    pair = SurfaceMap(neural, NEURAL[1], PAIR.map, PAIR.landmarks, figures, config)
+    trio = SurfaceCollection([neural, *NEURAL[1:]], TRIO.maps, TRIO.landmarks, figures, config)
+    for thing in (neural, flat, pair, trio):
+        thing.save(folder)
+        again = nsm.load(folder)
+        assert type(again) is type(thing)
+        assert (again.metrics, again.config) == (thing.metrics, thing.config)
+        if thing is neural:
+            same_surface(again, neural)
+        elif thing is flat:
+            same_surface(again.phi, neural)
+            assert np.array_equal(again.uv, flat.uv)
+            (folder / "map.json").unlink()
+        elif thing is pair:
+            same_surface(again.source, neural)
+            same_surface(again.target, NEURAL[1])
+            assert np.array_equal(again.image_uv, pair.image_uv)
+            (folder / "pair.json").unlink()
+        else:
+            for a, b in zip(again.surfaces, trio.surfaces, strict=True):
+                same_surface(a, b)
+            for h, other in zip(again.maps, trio.maps, strict=True):
+                same_map(h, other)
+
+
+@examples(25)
+@given(st.sampled_from([NEURAL[0], FLAT, PAIR, TRIO]), st.data())
+def test_a_changed_byte_is_told_or_does_no_harm(tmp_path_factory, thing, data):
+    folder = tmp_path_factory.mktemp("changed")
+    thing.save(folder)
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    file = data.draw(st.sampled_from(files))
+    content = bytearray(file.read_bytes())
+    content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    file.write_bytes(content)
+    try:
+        again = nsm.load(folder)
+    except NsmError as error:
+        assert "\n" not in str(error)
+    else:
+        assert type(again) is type(thing)
+
+
+@examples(40)
+@given(st.text(max_size=300))
+def test_a_name_of_nothing_is_told(text):
+    for function in (nsm.load, Surface.load):
+        with pytest.raises(NsmError) as caught:
+            function(f"?{text}")
+        assert cli_line(caught.value).count("\n") == 1
+
+
+# ------------------------------------------------------------------ surfaces
+
+
+@examples(40)
+@given(vertices=ANY_ARRAY, faces=ANY_ARRAY)
+def test_surfaces_of_any_arrays(vertices, faces):
+    try:
+        surface = Surface.from_arrays(vertices, faces)
+    except NsmError:
+        return
+    assert surface.quality["flipped_triangles"] == 0
+
+
+@examples(40)
+@given(
+    vertices=arrays.arrays(
+        np.float64, (6, 3), elements=st.floats(-1e6, 1e6) | st.sampled_from([np.nan, np.inf, 0.0])
+    ),
+    faces=arrays.arrays(np.int64, (5, 3), elements=st.integers(-1, 6)),
+)
+def test_surfaces_of_any_few_triangles(vertices, faces):
+    try:
+        surface = Surface.from_arrays(vertices, faces)
+    except NsmError:
+        return
+    assert surface.quality["flipped_triangles"] == 0
+    assert np.isfinite(surface.uv).all()
+    again = Surface.from_stored(surface.name, surface.domain, surface.to_stored())
+    assert again.content_key() == surface.content_key()
+
+
+@examples(30)
+@given(
+    st.lists(st.integers(-2, VERTICES + 1) | st.floats() | st.none(), max_size=4) | ANY_ARRAY,
+    st.sampled_from(["disc", "square", "ball", ""]),
+    st.sampled_from(["slim", "tutte", "none"]),
+)
+def test_seams_preimages_and_choices(numbers, domain, method):
+    s = NEURAL[0].surface
+    try:
+        assert s.preimages(numbers).shape == (len(numbers), 2)
+    except NsmError as error:
+        assert "\n" not in str(error)
+    try:
+        made = Surface.from_arrays(
+            s.vertices, s.faces, domain=domain, parameterization=method, seam_vertices=numbers
+        )
+    except NsmError as error:
+        assert "\n" not in str(error)
+    else:
+        assert made.domain == domain and made.quality["flipped_triangles"] == 0
+
+
+@examples(30)
+@given(st.text(max_size=20))
+def test_only_names_of_the_catalogue_are_meshes_of_it(text):
+    from nsm.surfaces.catalogue import catalogue_mesh
+
+    assert all("/" not in name and line for name, line in catalogue_names().items())
+    if text not in catalogue_names():
+        with pytest.raises(NsmError, match="not in the catalogue"):
+            catalogue_mesh(text)
+
+
+# ------------------------------------------------------------------ trainings
+
+
+class Started(Exception):
+    """A training began."""
+
+
+@pytest.fixture
+def untrained(monkeypatch):
+    def begin(*_, **__):
+        raise Started
+
+    composed = {}
+
+    def compose(words):
+        if tuple(words) not in composed:
+            composed[tuple(words)] = compose_config(words)
+        return copy.deepcopy(composed[tuple(words)])
+
+    monkeypatch.setattr(api, "compose_config", compose)
+    monkeypatch.setattr(pl.Trainer, "fit", begin)
+
+
+VERTEX = st.integers(-2, VERTICES + 1)
+POINT = st.tuples(*[st.floats(-2, 2) | st.just(math.nan)] * 3).map(list)
+LANDMARKS = st.one_of(
+    st.none(),
+    st.text(max_size=3),
+    st.integers(),
+    ANY_ARRAY,
+    st.lists(st.tuples(VERTEX, VERTEX), max_size=4),
+    st.lists(st.tuples(VERTEX, VERTEX), max_size=4).map(np.array),
+    st.lists(st.lists(VERTEX | POINT | st.none(), max_size=3), max_size=3),
+    st.dictionaries(st.sampled_from(["source", "target", "x"]), st.lists(VERTEX, max_size=3)),
+)
+SHAPES = st.sampled_from([NEURAL[0], NEURAL[1], None, 3, "none.obj", {"name": "paraboloid"}, {}])
+
+
+def begins(function: Callable, *given_: object, **options: object) -> bool:
+    """Whether a training began; NsmError, in one line, is the only other end."""
+    try:
+        function(*given_, progress=False, **options)
+    except NsmError as error:
+        assert cli_line(error).count("\n") == 1
+        return False
+    except Started:
+        return True
+    raise AssertionError("it ended without a training")
+
+
+@examples(15)
+@given(SHAPES, SHAPES, LANDMARKS)
+def test_what_map_pair_is_given(untrained, source, target, landmarks):
+    begins(nsm.map_pair, source, target, landmarks)
+
+
+@examples(10)
+@given(st.lists(SHAPES, max_size=4) | st.just(NEURAL) | SHAPES, LANDMARKS)
+def test_what_map_collection_is_given(untrained, surfaces, landmarks):
+    begins(nsm.map_collection, surfaces, landmarks)
+
+
+@examples(3)
+@given(
+    st.lists(
+        st.tuples(*[st.integers(0, INNER - 1)] * 2),
+        max_size=4,
+        unique_by=(lambda p: p[0], lambda p: p[1]),
+    ),
+    st.data(),
+)
+def test_good_landmarks_are_taken_and_bad_ones_told_first(untrained, pairs, data):
+    ends = NEURAL[0], NEURAL[1]
+    assert begins(nsm.map_pair, *ends, pairs)
+    bad = [(0, VERTICES), (-1, 0), (0, math.nan), (0, [0, 0, math.inf])]
+    assert not begins(nsm.map_pair, *ends, [*pairs, data.draw(st.sampled_from(bad))])
+    if pairs:
+        twice = (pairs[0][0], next(v for v in range(9) if v not in [q for _, q in pairs]))
+        assert not begins(nsm.map_pair, *ends, [*pairs, twice])
+        uneven = {"source": [p for p, _ in pairs], "target": [q for _, q in pairs][:-1]}
+        assert not begins(nsm.map_pair, *ends, uneven)
+
+
+@examples(5)
+@given(
+    st.sampled_from([NEURAL[0].surface, NEURAL[0], None, 3, "terrain"]),
+    st.lists(st.text(max_size=8) | st.sampled_from(["seed=1", "seed=x", "energy=a"]), max_size=2),
+)
+def test_what_overfit_and_parameterize_are_given(untrained, thing, overrides):
+    good = all(word == "seed=1" for word in overrides)
+    for function, kind in ((nsm.overfit, Surface), (nsm.parameterize, NeuralSurface)):
+        started = begins(function, thing, overrides=overrides)
+        assert not started or isinstance(thing, kind)
+        assert started or not (good and isinstance(thing, kind))
+
+
+def test_a_folder_that_cannot_be_is_told(untrained, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert not begins(nsm.overfit, NEURAL[0].surface, folder=tmp_path / "file" / "run")
+
+
+# ------------------------------------------------------------------ errors and extensions
+
+
+def cli_line(error: NsmError) -> str:
+    """What the command prints of it."""
+    import contextlib
+    import io
+
+    with contextlib.redirect_stderr(io.StringIO()) as told:
+        cli._say(str(error))
+    return told.getvalue()
+
+
+@examples(50)
+@given(st.text())
+def test_errors_are_one_line(text):
+    line = cli_line(NsmError(text))
+    assert line.count("\n") == 1 and line[:-1].isprintable()
+
+
+@pytest.fixture
+def tables():
+    """The registries, put back as they were."""
+    all_tables = (ENERGIES, ACTIVATIONS, ENCODINGS, BLOCKS, ANALYTIC)
+    before, own = [dict(table) for table in all_tables], set(extensions._OWN)
+    yield
+    for table, old in zip(all_tables, before, strict=True):
+        table.clear()
+        table.update(old)
+    extensions._OWN.clear()
+    extensions._OWN.update(own)
+
+
+class Doubled(torch.nn.Module):
+    def __init__(self, dim: int, factor: float = 2.0) -> None:
+        super().__init__()
+        self.out_dim, self.factor = dim, factor
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.factor * x
+
+
+NAMES = st.text(max_size=6) | st.from_regex(r"[a-z][a-z0-9_]{0,5}", fullmatch=True)
+KINDS = {
+    "energy": (nsm.register_energy, ENERGIES, lambda m: m.trace),
+    "activation": (nsm.register_activation, ACTIVATIONS, lambda z, a=1.0: a * z),
+    "encoding": (nsm.register_encoding, ENCODINGS, Doubled),
+    "block": (nsm.register_block, BLOCKS, lambda width, act: torch.nn.Linear(width, width)),
+    "analytic surface": (nsm.register_analytic, ANALYTIC, lambda u, v: (u, v, u * v)),
+}
+
+
+@examples(40)
+@given(NAMES | st.sampled_from(["arap", "softplus", "siren", "identity", "plain", "sphere_cap"]))
+def test_names_of_extensions(tables, name):
+    for kind, (register, table, thing) in KINDS.items():
+        taken = name in table and (kind, name) not in extensions._OWN
+        try:
+            register(name, thing)
+        except NsmError:
+            assert taken or not extensions._NAME.fullmatch(name)
+        else:
+            assert not taken and name in table
+
+
+@examples(3)
+@given(*[st.floats(0.01, 10)] * 3)
+def test_what_is_registered_is_what_is_used(tables, a, b, c):
+    nsm.register_energy("mine", lambda m: a * m.trace + b / (m.determinant + c))
+    source = torch.eye(2, dtype=torch.float64).expand(4, 2, 2)
+    target = torch.diag_embed(torch.tensor([[1.0, 1], [4, 1], [4, 9], [0, 1]]).double())
+    t, d = torch.tensor([2.0, 5, 13, 1]).double(), torch.tensor([1.0, 4, 36, 0]).double()
+    assert torch.allclose(energy("mine")(source, target), a * t + b / (d + c), rtol=1e-6)
+    nsm.register_activation("mine", lambda z, slope=1.0: slope * z)
+    z = torch.tensor([-a, b], dtype=torch.float64)
+    assert torch.allclose(Activation("mine", slope=c)(z), c * z)
+    nsm.register_encoding("mine", Doubled)
+    nsm.register_block("mine", lambda width, activation: torch.nn.Linear(width, width))
+    settings = {**NETWORK, "block": "mine", "activation": {"name": "mine"}}
+    network = NeuralMap(out_dim=3, encoding={"name": "mine", "factor": a}, **settings).double()
+    x = torch.tensor([[0.1, 0.2], [b / 10, c / 10]], dtype=torch.float64)
+    expected = torch.func.vmap(torch.func.jacrev(lambda p: network(p[None])[0]))(x)
+    assert torch.allclose(network.value_and_jacobian(x)[1], expected)
+    nsm.register_analytic("mine", lambda u, v, height=1.0: (u, v, height * u * v))
+    surface = build_analytic({"name": "mine", "height": c}).double()
+    p = surface(x) / surface(x)[:, :1] * x[:, :1]  # it is scaled to the area of the disc
+    assert torch.allclose(p, torch.stack([x[:, 0], x[:, 1], c * x[:, 0] * x[:, 1]], dim=1))
+
+
+# ------------------------------------------------------------------ nothing is left out
+
+PROPERTIES: dict[str, list[Callable]] = {
+    "NeuralSurface.__call__": [test_functions_of_the_domain, test_functions_of_tensors],
+    "NeuralSurface.jacobian": [test_functions_of_the_domain, test_jacobians_are_differences],
+    "NeuralSurface.in_original_units": [
+        test_functions_of_space,
+        test_points_keep_to_the_target_and_units_come_back,
+    ],
+    "NeuralSurface.to_mesh": [test_what_is_saved_is_what_is_loaded],
+    "NeuralSurface.save": [test_what_is_saved_is_what_is_loaded],
+    "NsmError": [test_errors_are_one_line],
+    "Parameterization.__call__": [test_functions_of_the_domain],
+    "Parameterization.mended": [test_what_is_mended_is_certified],
+    "Parameterization.save": [test_what_is_saved_is_what_is_loaded],
+    "Surface.from_arrays": [test_surfaces_of_any_arrays, test_surfaces_of_any_few_triangles],
+    "Surface.from_cut": [test_surfaces_of_any_few_triangles],
+    "Surface.from_stored": [test_surfaces_of_any_few_triangles],
+    "Surface.to_stored": [test_surfaces_of_any_few_triangles],
+    "Surface.content_key": [test_surfaces_of_any_few_triangles],
+    "Surface.load": [test_a_name_of_nothing_is_told],
+    "Surface.preimages": [test_seams_preimages_and_choices],
+    "SurfaceCollection.__len__": [test_pairs_of_a_collection],
+    "SurfaceCollection.pair": [test_pairs_of_a_collection],
+    "SurfaceCollection.mended": [test_what_is_mended_is_certified],
+    "SurfaceCollection.save": [test_what_is_saved_is_what_is_loaded],
+    "SurfaceMap.__call__": [test_functions_of_space],
+    "SurfaceMap.planar": [
+        test_functions_of_the_domain,
+        test_points_keep_to_the_target_and_units_come_back,
+    ],
+    "SurfaceMap.transfer": [test_transfer],
+    "SurfaceMap.morph": [test_morph],
+    "SurfaceMap.aligned": [test_functions_of_space],
+    "SurfaceMap.mended": [test_what_is_mended_is_certified],
+    "SurfaceMap.save": [test_what_is_saved_is_what_is_loaded],
+    "catalogue_names": [test_only_names_of_the_catalogue_are_meshes_of_it],
+    "load": [test_what_is_saved_is_what_is_loaded, test_a_changed_byte_is_told_or_does_no_harm],
+    "map_collection": [test_what_map_collection_is_given],
+    "map_pair": [
+        test_what_map_pair_is_given,
+        test_good_landmarks_are_taken_and_bad_ones_told_first,
+    ],
+    "overfit": [test_what_overfit_and_parameterize_are_given],
+    "parameterize": [test_what_overfit_and_parameterize_are_given],
+    **{
+        f"register_{kind.split()[0]}": [
+            test_names_of_extensions,
+            test_what_is_registered_is_what_is_used,
+        ]
+        for kind in KINDS
+    },
+}
+
+
+def public() -> list[str]:
+    """Every public function, and every public method of public classes."""
+    names = []
+    for name in nsm.__all__:
+        thing = getattr(nsm, name)
+        if not inspect.isclass(thing) or issubclass(thing, Exception):
+            names.append(name)
+            continue
+        for attribute, value in vars(thing).items():
+            own = inspect.isfunction(value) or isinstance(value, classmethod)
+            called = attribute in ("__call__", "__len__")
+            if own and (called or not attribute.startswith("_")):
+                names.append(f"{name}.{attribute}")
+    return names
+
+
+def test_everything_public_has_a_property():
+    assert sorted(PROPERTIES) == sorted(public())
+    for tests in PROPERTIES.values():
+        assert tests
+        for test in tests:
+            assert getattr(test, "is_hypothesis_test", False)
+            assert Path(inspect.getfile(test)) == Path(__file__)

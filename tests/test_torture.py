@@ -1,0 +1,64 @@
+"""Some of what ``make torture`` tries, quick enough for every change; and its result, as kept."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+torture = pytest.importorskip("torture.__main__")
+
+QUICK = (
+    "scale 1e-40",
+    "Möbius strip",
+    "book of three pages",
+    "chessboard",
+    "two parts",
+    "at a point",
+    "NaN",
+    "one triangle domain=square",
+    "landmark twice",
+    "landmark of text",
+    "binary.ply: first 50%",
+    "glb: noise",
+    "stl: a letter",
+    "GLTF of 1e8 copies",
+    "PLY of 1e18 faces",
+    "OBJ in UTF-16",
+    "face of vertex 1e30",
+    "name with ${}",
+    "a link to itself",
+    "outputs is a file",
+    "no file above 2 kB",
+    "needles 1e-13",
+)
+CASES = {case.name: case for case in torture.all_cases()}
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("name", QUICK)
+def test_it_is_right_or_refused_in_one_line(name):
+    trial = torture.Trial(CASES[name], torture.SECONDS)
+    while (result := trial.result()) is None:
+        time.sleep(0.01)
+    assert result["outcome"] != torture.FAILED, result["complaints"]
+
+
+def test_no_two_cases_have_one_name():
+    names = [(case.group, case.name) for case in torture.all_cases()]
+    assert len(set(names)) == len(names)
+
+
+def test_the_judge_sees_what_is_wrong(tmp_path):
+    """A run that says nothing, says too much, or leaves a result where it was refused, fails."""
+    case = CASES["Möbius strip"]
+
+    def judged(status, told, left=()):
+        return torture._judged(case, status, "", told, tmp_path, set(left))
+
+    assert judged(2, "nsm: mesh: one-sided\n") == (torture.REFUSED, "mesh: one-sided", [])
+    assert judged(2, "nsm: a\nnsm: b\n")[2] and judged(2, "")[2] and judged(1, "nsm: a\n")[2]
+    assert judged(2, "nsm: a\n", [tmp_path / "metrics.json"])[2]
+    assert judged(-9, "")[2] and judged(0, "")[2] and judged(2, "Traceback\n")[2]

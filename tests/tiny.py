@@ -1,0 +1,65 @@
+"""A small result of every kind, made without a training."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from nsm.maps import NeuralMap, Rotated, build_planar
+from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
+from nsm.surfaces import Surface
+from nsm.surfaces.shapes import ring_mesh
+
+NETWORK = {"width": 4, "depth": 1, "block": "plain"}
+
+
+class Results(NamedTuple):
+    """Three surfaces, and one map of each kind between them."""
+
+    neural: list[NeuralSurface]
+    flat: Parameterization
+    pair: SurfaceMap
+    trio: SurfaceCollection
+
+
+def stirred(module: torch.nn.Module) -> torch.nn.Module:
+    """A network that maps to something, injectively: its weights moved a little, and frozen."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(parameter + 0.05 * torch.randn(parameter.shape, generator=generator))
+    return module.eval().requires_grad_(False)
+
+
+def planar(onto: str | None = "disc") -> torch.nn.Module:
+    """A map of the plane that is near the identity."""
+    return stirred(build_planar({**NETWORK, "onto": onto}))
+
+
+def dome(height: float, rings: int) -> Surface:
+    """A cap over the disc, of that many rings of triangles."""
+    uv, faces = ring_mesh(rings)
+    z = height * (1 - (uv**2).sum(axis=1))
+    return Surface.from_arrays(np.column_stack([uv, z]), faces, name=f"dome {height}")
+
+
+def results(rings: int) -> Results:
+    """The results, on domes of that many rings of triangles."""
+    neural = [
+        NeuralSurface(
+            dome(0.2 * (k + 1), rings),
+            stirred(NeuralMap(out_dim=3, **NETWORK)),
+            {"rms_percent": 1.0},
+            {"seed": k},
+        )
+        for k in range(3)
+    ]
+    h = [Rotated(planar(), torch.eye(2)) for _ in neural]
+    return Results(
+        neural,
+        Parameterization(neural[0], planar(None)),
+        SurfaceMap(neural[0], neural[1], h[0], np.array([[0, 0], [5, 6]])),
+        SurfaceCollection(neural, h, np.array([[0, 0, 0]])),
+    )
