@@ -38,6 +38,7 @@ NAMES = ("bunny", "shrec07-384", "igea")
 MARKS = (5.0, 10.0, 20.0, 30.0)  # seconds of one thread
 STEPS = 3300  # about what the default makes of the budget
 HELD_OUT = 30_000
+LATE = 1.15  # the first step's end after a mark stands for it when it is no later than this
 
 # by topic, what is changed from the default
 TRIALS: dict[str, dict[str, list[str]]] = {
@@ -80,12 +81,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
             "optimizer.lr=1e-3",
             "optimizer.encoding_lr=1e-4",
         ],
-        "fitted, 32, 128, 512, rates 1e-4": [
-            "map.readout=fitted",
-            "encoding.resolutions=[32,128,512]",
-            "optimizer.lr=1e-4",
-            "optimizer.encoding_lr=1e-4",
-        ],
+        "experiment=fitted": ["experiment=fitted"],
         "fitted, Fourier, 64": ["map.readout=fitted", "encoding=fourier"],
     },
     "network": {
@@ -117,6 +113,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "Adam, rates tripled": ["optimizer.lr=1e-2", "optimizer.encoding_lr=1e-1"],
         "Adam, one rate": ["optimizer.encoding_lr=3e-3"],
         "Adam, β₂ = 0.999": ["optimizer.betas=[0.9,0.999]"],
+        "L-BFGS, batch 16,384": ["optimizer=lbfgs", "data.batch_size=16384"],
     },
     "schedule": {
         "constant": ["scheduler=constant"],
@@ -151,18 +148,21 @@ def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
     curve: list[dict[str, Any]] = []
 
     def at_mark(module: Any, seconds: float, step: int) -> None:
+        if clock.spent > LATE * seconds:  # the start took longer: there was nothing yet
+            return
         found = pointwise_metrics(surface, module.map.eval(), samples=HELD_OUT)
         curve.append({"cpu_seconds": seconds, "steps": step, **found})
         module.map.train()
 
-    module = train(config, surface, [OnTheClock(MARKS, at_mark)], max_steps=-1)[1]
+    clock = OnTheClock(MARKS, at_mark)
+    module = train(config, surface, [clock], max_steps=-1)[1]
     return {"curve": curve, "wrinkles": normal_variation(surface, module.map.eval())}
 
 
 def slug(trial_name: str) -> str:
     """A trial's name as a file's."""
     plain = trial_name.replace("×", "x").replace("σ", "sigma").replace("λ", "lambda")
-    plain = plain.replace("β₂", "beta2").replace("500,000", "500000")
+    plain = plain.replace("β₂", "beta2").replace("500,000", "500000").replace("16,384", "16384")
     return re.sub(r"[^a-z0-9.=]+", "-", plain.lower()).strip("-")
 
 
@@ -187,7 +187,8 @@ def tables() -> str:
         for trials in TRIALS.values():
             for key in (key for key in trials if key in found):
                 curve, wrinkles = found[key]["curve"], found[key]["wrinkles"]
-                cells = [f"{point['rms_percent']:.3f}" for point in curve]
+                at = {point["cpu_seconds"]: f"{point['rms_percent']:.4f}" for point in curve}
+                cells = [at.get(mark, "not yet") for mark in MARKS]
                 cells.append(f"{curve[-1]['normal_error_mean_degrees']:.2f}°")
                 cells.append(f"{wrinkles['normal_variation_error_degrees']:.2f}°")
                 cells.append(f"{curve[-1]['steps']}")

@@ -16,9 +16,12 @@ OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
     "adamw": torch.optim.AdamW,
     "rmsprop": torch.optim.RMSprop,
     "sgd": torch.optim.SGD,
+    "lbfgs": torch.optim.LBFGS,
 }
 # those that torch offers as one operation for all parameters
 _FUSED = ("adam", "adamw", "sgd")
+# those that take one group of parameters, and so one learning rate
+_WHOLE = ("lbfgs",)
 Factor = Callable[[float], float]  # of the step: share of the full learning rate
 
 
@@ -74,6 +77,8 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
     grids = [p for key, p in named if ".tables." in key]
     others = [p for key, p in named if ".tables." not in key]
     # the names are those of the learning rates in the log
+    if name in _WHOLE:
+        others, grids = others + grids, []
     groups: list[dict[str, Any]] = [{"params": others, "name": "network"}]
     if grids:
         groups.append({"params": grids, "lr": encoding_lr or rest["lr"], "name": "encoding"})

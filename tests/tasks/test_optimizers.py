@@ -70,3 +70,19 @@ def test_unknown_schedule_is_refused():
 def test_cosine_is_half_a_wave():
     lr = rates({"name": "cosine"}, 10, 10)
     assert lr == pytest.approx([0.5 * (1 + math.cos(math.pi * k / 10)) for k in range(10)])
+
+
+def test_lbfgs_solves_a_quadratic_with_grids_and_network_as_one():
+    network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
+    settings = {"name": "lbfgs", "lr": 1.0, "max_iter": 50, "line_search_fn": "strong_wolfe"}
+    optimizer = build_optimizer(network, settings)
+    assert len(optimizer.param_groups) == 1
+
+    def loss():
+        optimizer.zero_grad()
+        value = sum((p - 1).square().sum() for p in network.parameters())
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    assert all(torch.allclose(p, torch.ones_like(p), atol=1e-4) for p in network.parameters())
