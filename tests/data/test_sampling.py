@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from thorough import examples
+from tiny import dome
 
 from nsm.data import OverfitData, SurfaceSampler
 from nsm.surfaces import Surface
+from nsm.surfaces.location import locate
 
 
 def nearest(points, others):
@@ -94,3 +99,22 @@ def test_held_out_points_are_not_trained_on(uneven):
     assert len(held_out) == 512
     for step in range(3):
         assert float(nearest(held_out, data.batch(step).uv).min()) > 0
+
+
+DOME = dome(0.5, 3)
+
+
+@examples(20)
+@given(st.integers(0, 200), st.floats(0, 1), st.integers(0, 2**62), st.integers(0, 10**9))
+def test_any_draw_lies_on_the_surface_and_comes_again(count, share, seed, step):
+    sampler = SurfaceSampler(DOME)
+    samples = sampler.draw(count, share, sampler.generator(seed, step))
+    assert [len(part) for part in samples] == [count] * 3
+    assert all(part.isfinite().all() for part in samples)
+    assert (samples.uv.norm(dim=1) <= 1 + 1e-6).all()
+    assert torch.allclose(samples.normals.norm(dim=1), torch.ones(count), atol=1e-5)
+    places = locate(samples.uv.double().numpy(), DOME.uv, DOME.faces)
+    there = places.take(DOME.vertices, DOME.faces)
+    assert np.allclose(there, samples.points.numpy(), atol=1e-5)
+    again = sampler.draw(count, share, sampler.generator(seed, step))
+    assert all(torch.equal(a, b) for a, b in zip(samples, again, strict=True))

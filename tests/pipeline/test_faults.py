@@ -9,14 +9,16 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
+from tiny import results
 
 import nsm
 from nsm.config import compose_config
 from nsm.errors import NsmError
-from nsm.pipeline import run_overfit
+from nsm.pipeline import run_overfit, run_pair_map, run_param
 from nsm.pipeline.alone import alone
 from nsm.results import analytic
 from nsm.results.analytic import analytic_surface
@@ -215,6 +217,65 @@ def test_killed_while_saving_it_ends_at_the_same_weights(surface, tmp_path, whol
     run(surface, folder, resuming=True)
     assert same(weights(folder), whole)
     assert not list(folder.glob("*.tmp"))
+
+
+MAP_WORDS = ["data.batch_size=64", "data.held_out=64", "data.steps_per_epoch=4", "logger=none"]
+MAP_WORDS += ["trainer.max_steps=20", "trainer.threads=1", "trainer.progress=false"]
+MAP_WORDS += ["artefacts=false", "map.width=8", "map.depth=1"]
+
+
+def mapped(task, folder, resuming=False):
+    """What a map's training ends at: the weights, and where the vertices go."""
+    phi, psi, _ = tiny_surfaces()
+    config = compose_config([f"task={task}", *MAP_WORDS])
+    if task == "param":
+        result = run_param(config, folder, phi, resuming=resuming)
+        return {**result.map.state_dict(), "uv": torch.from_numpy(result.uv)}
+    result = run_pair_map(config, folder, phi, psi, [(0, 0), (9, 8)], resuming=resuming)
+    return {**result.map.state_dict(), "uv": torch.from_numpy(result.image_uv)}
+
+
+@cache
+def tiny_surfaces():
+    return results(rings=3).neural
+
+
+class Calls:
+    """Counts the calls of Python functions, and kills the process at the last of so many."""
+
+    def __init__(self, last=None):
+        self.count, self.last = 0, last
+
+    def __enter__(self):
+        sys.setprofile(self)
+        return self
+
+    def __exit__(self, *_):
+        sys.setprofile(None)
+
+    def __call__(self, frame, event, argument):
+        self.count += event == "call"
+        if self.count == self.last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("task", ["param", "pair_map"])
+def test_a_map_killed_at_random_moments_ends_at_the_same_result(tmp_path, task):
+    """Whatever it was doing: preparing, training, saving, certifying, writing its results."""
+    mapped(task, tmp_path / "first")  # what is imported late is imported now
+    with Calls() as calls:
+        expected = mapped(task, tmp_path / "whole")
+    chance, folder = random.Random(task), tmp_path / "killed"
+    for share in (chance.uniform(0.2, 0.6), chance.uniform(0.1, 0.5)):
+
+        def work(last=int(share * calls.count)):
+            with Calls(last):
+                mapped(task, folder, resuming=folder.exists())
+
+        assert died(forked(work))
+    assert same(mapped(task, folder, resuming=True), expected)
+    assert not list(folder.glob("*.tmp")) and (folder / "metrics.json").exists()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
