@@ -259,9 +259,13 @@ def read_config(file: Path) -> DictConfig:
         if file.stat().st_size > _LARGEST_CONFIG:
             raise ValueError(f"larger than {_LARGEST_CONFIG} bytes")
         text = file.read_text(encoding="utf-8")
+        before: yaml.Event | None = None
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
                 raise ValueError("anchors are not taken")
+            if isinstance(event, yaml.ScalarEvent) and isinstance(before, yaml.DocumentStartEvent):
+                raise ValueError("a lone word")  # OmegaConf would fail on some of them
+            before = event
             if getattr(event, "tag", None):
                 raise ValueError("tags are not taken")
             if isinstance(event, yaml.ScalarEvent) and "${" in event.value:

@@ -1,5 +1,6 @@
 """Some of what ``make torture`` tries, quick enough for every change; and its result, as kept."""
 
+import json
 import os
 import sys
 import time
@@ -62,3 +63,11 @@ def test_the_judge_sees_what_is_wrong(tmp_path):
     assert judged(2, "nsm: a\nnsm: b\n")[2] and judged(2, "")[2] and judged(1, "nsm: a\n")[2]
     assert judged(2, "nsm: a\n", [tmp_path / "metrics.json"])[2]
     assert judged(-9, "")[2] and judged(0, "")[2] and judged(2, "Traceback\n")[2]
+
+
+def test_the_kept_result_is_of_all_cases_and_none_failed():
+    results = json.loads(torture.RESULT.read_text())["cases"]
+    assert {r["outcome"] for r in results} == {torture.SOLVED, torture.REFUSED}
+    kept = {(r["group"], r["case"]) for r in results}
+    assert kept >= {(case.group, case.name) for case in torture.all_cases()}
+    assert torture.table(results) in torture.PAGE.read_text()
