@@ -45,9 +45,20 @@ def _run(config: DictConfig) -> bool:
         _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
         return False
     finally:
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()  # nothing came of it: leave no empty folder behind
+        _leave_no_empty(folder)
     return True
+
+
+def _leave_no_empty(folder: Path) -> None:
+    """Remove a run folder that nothing came of, and the folders around it that are empty by this.
+
+    Those outside the working directory are not Hydra's, and stay.
+    """
+    inside = [place for place in folder.parents if place.is_relative_to(Path.cwd())]
+    for place in (folder, *inside):
+        if place == Path.cwd() or not place.is_dir() or any(place.iterdir()):
+            return
+        place.rmdir()
 
 
 def main() -> None:

@@ -344,9 +344,10 @@ def test_bad_input_is_told_in_one_line(here, bad_files, monkeypatch, words, told
     assert told in run.stderr and len(run.stderr.strip().splitlines()) == 1, run.stderr
 
 
-def test_a_collection_needs_three_surfaces(here):
+def test_a_collection_needs_three_surfaces(here, tmp_path):
     run = here("task=collection_map", "surfaces=[saddle,cone]")
     assert run.returncode == 2 and "three surfaces" in run.stderr
+    assert not list(tmp_path.iterdir())  # no empty folder either
 
 
 def test_landmarks_come_in_many_forms(tmp_path):
