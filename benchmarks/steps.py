@@ -1,6 +1,6 @@
-"""What makes a training need fewer steps: one change from the default at a time, at equal time.
+"""What makes a training need fewer steps: one change from a base at a time, at equal time.
 
-Each trial overfits one mesh with the default settings and one thing changed, for a budget of CPU
+Each trial overfits one mesh with the settings of BASE and one thing changed, for a budget of CPU
 time of one thread, from the network's making on, start values included. Errors are taken at marks
 on points that no training sees; that time does not count. A schedule with an end follows the clock:
 it ends with the budget, as with ``trainer.max_steps`` set to the steps that the budget holds,
@@ -40,7 +40,47 @@ STEPS = 3300  # about what the default makes of the budget
 HELD_OUT = 30_000
 LATE = 1.15  # the first step's end after a mark stands for it when it is no later than this
 
-# by topic, what is changed from the default
+# What trials change: the default settings of when the first were made, spelt out by group, so that
+# a trial means the same whatever the default has become.
+BASE: dict[str, list[str]] = {
+    "domain": ["domain=disc"],
+    "surface": ["surface.parameterization=slim"],
+    "map": [
+        "map=mlp",
+        "map.width=64",
+        "map.depth=1",
+        "map.block=plain",
+        "map.initialisation=kaiming",
+        "map.readout=none",
+    ],
+    "activation": ["activation=softplus", "activation.beta=10"],
+    "encoding": [
+        "encoding=spline_grid",
+        "encoding.resolutions=[16,64,256]",
+        "encoding.features=4",
+        "encoding.degree=2",
+        "encoding.extent=1.05",
+    ],
+    "lambda": ["lambda=overfit", "energy.lambda_normal=0.01"],
+    "sampler": [
+        "sampler=fresh_with_vertices",
+        "data.vertex_share=0.1",
+        "data.domain_share=0",
+        "data.pool=null",
+    ],
+    "data": ["data.batch_size=1024"],
+    "optimizer": [
+        "optimizer=adam",
+        "optimizer.lr=3e-3",
+        "optimizer.encoding_lr=3e-2",
+        "optimizer.betas=[0.9,0.99]",
+        "optimizer.eps=1e-12",
+    ],
+    "scheduler": ["scheduler=cosine", "scheduler.warmup=100", "scheduler.final=0"],
+    "trainer": ["trainer.gradient_clip=null", "trainer.precision=float32", "trainer.compile=false"],
+}
+
+# by topic, what is changed from BASE
 TRIALS: dict[str, dict[str, list[str]]] = {
     "default": {
         "default": [],
@@ -81,7 +121,13 @@ TRIALS: dict[str, dict[str, list[str]]] = {
             "optimizer.lr=1e-3",
             "optimizer.encoding_lr=1e-4",
         ],
-        "experiment=fitted": ["experiment=fitted"],
+        # spelt out, as the base is
+        "experiment=fitted": [
+            "map.readout=fitted",
+            "encoding.resolutions=[32,128,512]",
+            "optimizer.lr=1e-4",
+            "optimizer.encoding_lr=1e-4",
+        ],
         "fitted, Fourier, 64": ["map.readout=fitted", "encoding=fourier"],
     },
     "network": {
@@ -99,6 +145,8 @@ TRIALS: dict[str, dict[str, list[str]]] = {
     "samples": {
         "no vertices": ["sampler=fresh"],
         "half vertices": ["data.vertex_share=0.5"],
+        "half uniform in Ω": ["data.domain_share=0.5"],
+        "a fifth uniform in Ω": ["data.domain_share=0.2"],
         "pool of 500,000": ["sampler=pool"],
         "batch 256": ["data.batch_size=256"],
         "batch 512": ["data.batch_size=512"],
@@ -113,6 +161,12 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "Adam, rates tripled": ["optimizer.lr=1e-2", "optimizer.encoding_lr=1e-1"],
         "Adam, one rate": ["optimizer.encoding_lr=3e-3"],
         "Adam, β₂ = 0.999": ["optimizer.betas=[0.9,0.999]"],
+        "Muon": ["optimizer=muon"],
+        "Muon, rates a third": [
+            "optimizer=muon",
+            "optimizer.lr=1e-3",
+            "optimizer.encoding_lr=1e-2",
+        ],
         "L-BFGS, batch 16,384": ["optimizer=lbfgs", "data.batch_size=16384"],
     },
     "schedule": {
@@ -140,6 +194,17 @@ class OnTheClock(Clock):
                 scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
 
 
+def in_full(changes: list[str]) -> list[str]:
+    """All words of a trial: BASE but for the groups that it chooses itself, and its changes.
+
+    An experiment is a whole of its own, without BASE.
+    """
+    chosen = {change.partition("=")[0] for change in changes}
+    if "experiment" in chosen:
+        return changes
+    return [word for group in BASE if group not in chosen for word in BASE[group]] + changes
+
+
 def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
     """Errors at the marks of one mesh's training with these overrides."""
     config = compose_config([*words, f"trainer.max_steps={STEPS}"])
@@ -162,7 +227,12 @@ def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
 def slug(trial_name: str) -> str:
     """A trial's name as a file's."""
     plain = trial_name.replace("×", "x").replace("σ", "sigma").replace("λ", "lambda")
-    plain = plain.replace("β₂", "beta2").replace("500,000", "500000").replace("16,384", "16384")
+    plain = (
+        plain.replace("β₂", "beta2")
+        .replace("Ω", "domain")
+        .replace("500,000", "500000")
+        .replace("16,384", "16384")
+    )
     return re.sub(r"[^a-z0-9.=]+", "-", plain.lower()).strip("-")
 
 
@@ -254,10 +324,10 @@ def main() -> None:
                     "mesh": name,
                     "topic": topic,
                     "trial": key,
-                    "overrides": trials[key],
+                    "overrides": in_full(trials[key]),
                     "torch": torch.__version__,
                     "machine": platform.machine(),
-                    **trial(trials[key], name, arguments.meshes),
+                    **trial(in_full(trials[key]), name, arguments.meshes),
                 }
                 file.parent.mkdir(parents=True, exist_ok=True)
                 atomic_write(file, (json.dumps(words, indent=1) + "\n").encode())

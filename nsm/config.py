@@ -75,6 +75,7 @@ class DataSchema:
     batch_size: int = MISSING
     steps_per_epoch: int = MISSING
     vertex_share: float = MISSING
+    domain_share: float = 0.0
     pool: int | None = MISSING
     held_out: int = MISSING
 
@@ -235,8 +236,11 @@ def checked(config: DictConfig) -> DictConfig:
     if typed.trainer.precision not in PRECISIONS:
         words = ", ".join(PRECISIONS)
         raise NsmError(f"setting trainer.precision: {typed.trainer.precision} is not of {words}")
-    if not 0 <= typed.data.vertex_share <= 1:
-        raise NsmError(f"setting data.vertex_share: {typed.data.vertex_share} is not in [0, 1]")
+    for key in ("vertex_share", "domain_share"):
+        if not 0 <= typed.data[key] <= 1:
+            raise NsmError(f"setting data.{key}: {typed.data[key]} is not in [0, 1]")
+    if typed.data.vertex_share + typed.data.domain_share > 1:
+        raise NsmError("setting data.domain_share: with data.vertex_share it is more than 1")
     from nsm.choices import check_choices  # torch takes seconds; mistakes above need not wait
 
     check_choices(typed)

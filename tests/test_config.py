@@ -107,6 +107,7 @@ def test_paper_settings_are_those_of_the_paper():
         ("trainer.accelerator=gppu", "'gpu'"),
         ("data.batch_size=0", "data.batch_size"),
         ("data.vertex_share=2", "data.vertex_share"),
+        ("data.domain_share=0.95", "data.domain_share"),
         ("trainer.precision=half", "float32, tf32, bf16"),
         ("trainer.max_steps=[", "trainer.max_steps=["),
         ("map.block=pots", "'post'"),

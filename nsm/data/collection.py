@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import pytorch_lightning as pl
 import torch
@@ -23,7 +23,8 @@ class CollectionData(pl.LightningDataModule):
         turns: (k, 2, 2) rotations from the common domain to that of each surface.
         batch_size: points a step, of all surfaces together.
         steps_per_epoch: steps between two looks at the held-out points.
-        vertex_share: share of a batch that are mesh vertices, in [0, 1].
+        vertex_share, domain_share: shares of a batch that are mesh vertices, and that are uniform
+            in the domain, not by area; in [0, 1], their sum too.
         held_out: points on which the distortion is followed; never trained on.
         pool: not used; the paper draws afresh for maps.
         seed: of the training samples.
@@ -38,6 +39,7 @@ class CollectionData(pl.LightningDataModule):
         steps_per_epoch: int,
         vertex_share: float,
         held_out: int,
+        domain_share: float = 0.0,
         pool: int | None = None,
         seed: int = 0,
     ) -> None:
@@ -45,7 +47,8 @@ class CollectionData(pl.LightningDataModule):
         self.surfaces, self.turns = surfaces, turns
         self.share = max(1, batch_size // len(surfaces))
         self.held_share = max(1, held_out // len(surfaces))
-        self.steps_per_epoch, self.vertex_share, self.seed = steps_per_epoch, vertex_share, seed
+        self.steps_per_epoch, self.seed = steps_per_epoch, seed
+        self.shares = {"vertex_share": vertex_share, "domain_share": domain_share}
         self.part = Part()
 
     def setup(self, stage: str | None = None) -> None:
@@ -56,13 +59,13 @@ class CollectionData(pl.LightningDataModule):
 
     def batch(self, step: int) -> Tensor:
         """The training samples (N, 2) of a step; of several processes, this one's part of them."""
-        return self.part.of_rows(self._drawn(self.share, self.vertex_share, self.seed, step))
+        return self.part.of_rows(self._drawn(self.share, self.shares, self.seed, step))
 
-    def _drawn(self, count: int, vertex_share: float, seed: int, step: int) -> Tensor:
+    def _drawn(self, count: int, shares: Mapping[str, float], seed: int, step: int) -> Tensor:
         # one stream for all: the samples of the surfaces are independent
         generator = self.samplers[0].generator(seed, step)
         parts = [
-            sampler.draw(count, vertex_share, generator).uv @ turn  # R⁻¹ = Rᵀ
+            sampler.draw(count, generator=generator, **shares).uv @ turn  # R⁻¹ = Rᵀ
             for sampler, turn in zip(self.samplers, self.turns, strict=True)
         ]
         return torch.cat(parts)
@@ -71,5 +74,5 @@ class CollectionData(pl.LightningDataModule):
         return Steps.following(self.trainer, self.batch, self.steps_per_epoch)
 
     def val_dataloader(self) -> DataLoader[Tensor]:
-        points = self._drawn(self.held_share, 0.0, HELD_OUT_SEED, 0)
+        points = self._drawn(self.held_share, {"vertex_share": 0.0}, HELD_OUT_SEED, 0)
         return DataLoader(list(points.split(8192)), batch_size=None)  # type: ignore[arg-type]

@@ -50,6 +50,8 @@ class OverfitData(pl.LightningDataModule):
         batch_size: points a step.
         steps_per_epoch: steps between two looks at the held-out points.
         vertex_share: share of a batch that are mesh vertices, in [0, 1].
+        domain_share: share of a batch that is uniform in Ω, not by area; 1 with the vertices' at
+            most. Errors are not weighted: it says how much each part of the surface counts.
         pool: None to draw afresh each step; a number for a fixed set of so many points (all
             vertices among them), as published, from which the batches are picked.
         held_out: points on which the error is followed; never trained on.
@@ -63,6 +65,7 @@ class OverfitData(pl.LightningDataModule):
         batch_size: int = 4096,
         steps_per_epoch: int = 250,
         vertex_share: float = 0.1,
+        domain_share: float = 0.0,
         pool: int | None = None,
         held_out: int = 16_384,
         seed: int = 0,
@@ -70,7 +73,7 @@ class OverfitData(pl.LightningDataModule):
         super().__init__()
         self.surface = surface
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
-        self.vertex_share, self.pool_size = vertex_share, pool
+        self.vertex_share, self.domain_share, self.pool_size = vertex_share, domain_share, pool
         self.held_out, self.seed = held_out, seed
         self.part = Part()
 
@@ -91,7 +94,8 @@ class OverfitData(pl.LightningDataModule):
     def _whole(self, step: int) -> Samples:
         generator = self.sampler.generator(self.seed, step)
         if self.pool is None:
-            return self.sampler.draw(self.batch_size, self.vertex_share, generator)
+            shares = {"vertex_share": self.vertex_share, "domain_share": self.domain_share}
+            return self.sampler.draw(self.batch_size, generator=generator, **shares)
         index = torch.randint(
             len(self.pool.uv),
             (self.batch_size,),

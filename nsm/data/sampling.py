@@ -19,7 +19,7 @@ class Samples(NamedTuple):
 
 
 class SurfaceSampler:
-    """Draws points of a surface on a device, uniformly by area on the mesh.
+    """Draws points of a surface on a device, uniformly by area on the mesh or in Ω.
 
     Args:
         surface: the prepared surface.
@@ -35,9 +35,10 @@ class SurfaceSampler:
         cross = torch.linalg.cross(b - a, c - a)
         double_area = cross.norm(dim=1)
         self.normals = cross / double_area.clamp_min(1e-30)[:, None]
-        # summed in float64: with a million faces a float32 sum would lose the small ones
-        cumulative = double_area.double().cumsum(0)
-        self.cumulative_area = cumulative / cumulative[-1]
+        self.cumulative_area = _cumulative(double_area)
+        a, b, c = self.uv[self.faces].double().unbind(dim=1)
+        u, v = b - a, c - a
+        self.cumulative_domain_area = _cumulative((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).abs())
         weighted = torch.zeros_like(self.vertices)
         weighted.index_add_(0, self.faces.reshape(-1), cross.repeat_interleave(3, dim=0))
         self.vertex_normals = weighted / weighted.norm(dim=1, keepdim=True).clamp_min(1e-30)
@@ -64,10 +65,14 @@ class SurfaceSampler:
         jacobian = torch.linalg.solve_ex(sides, edges, left=False).result
         return self._at(face, weights), jacobian.to(self.vertices.dtype)
 
-    def _places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Faces (N,) and barycentric weights (N, 3) of points that are uniform by area."""
+    def _places(
+        self, count: int, generator: torch.Generator, cumulative: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Faces (N,) and barycentric weights (N, 3) of points that are uniform by area, or by
+        another measure of the faces, given as its share of all faces up to each (M,)."""
+        cumulative = self.cumulative_area if cumulative is None else cumulative
         dice = torch.rand(count, generator=generator, device=self.device, dtype=torch.float64)
-        face = torch.searchsorted(self.cumulative_area, dice).clamp(max=len(self.faces) - 1)
+        face = torch.searchsorted(cumulative, dice).clamp(max=len(self.faces) - 1)
         r = torch.rand(count, 2, generator=generator, device=self.device)
         root = r[:, 0].sqrt()
         weights = torch.stack([1 - root, root * (1 - r[:, 1]), root * r[:, 1]], dim=1)
@@ -85,10 +90,23 @@ class SurfaceSampler:
         """Samples at the given vertices (N,), with area-weighted vertex normals."""
         return Samples(self.uv[index], self.vertices[index], self.vertex_normals[index])
 
-    def draw(self, count: int, vertex_share: float, generator: torch.Generator) -> Samples:
-        """``count`` points: a share of random vertices, the rest by area."""
+    def in_domain(self, count: int, generator: torch.Generator) -> Samples:
+        """``count`` points, uniform in Ω."""
+        return self._at(*self._places(count, generator, self.cumulative_domain_area))
+
+    def draw(
+        self,
+        count: int,
+        vertex_share: float,
+        generator: torch.Generator,
+        domain_share: float = 0.0,
+    ) -> Samples:
+        """``count`` points: a share of random vertices, a share uniform in Ω, the rest by area."""
         at_vertices = round(count * vertex_share)
-        samples = self.by_area(count - at_vertices, generator)
+        in_domain = min(round(count * domain_share), count - at_vertices)
+        samples = self.by_area(count - at_vertices - in_domain, generator)
+        if in_domain:
+            samples = _join(samples, self.in_domain(in_domain, generator))
         if at_vertices == 0:
             return samples
         index = torch.randint(
@@ -101,6 +119,13 @@ class SurfaceSampler:
         everywhere = torch.arange(len(self.vertices), device=self.device)
         rest = self.by_area(max(count - len(everywhere), 0), generator)
         return _join(rest, self.at_vertices(everywhere))
+
+
+def _cumulative(areas: Tensor) -> Tensor:
+    """Of the faces up to each: share of the whole area."""
+    # summed in float64: with a million faces a float32 sum would lose the small ones
+    cumulative = areas.double().cumsum(0)
+    return cumulative / cumulative[-1]
 
 
 def _join(a: Samples, b: Samples) -> Samples:

@@ -7,9 +7,70 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
+
+
+class MuonBesideAdam(Optimizer):
+    """Muon (Jordan et al., 2024) for weight matrices, and Adam for all else, as one optimiser.
+
+    Muon's steps are scaled to the size of Adam's, so that both take the same rates. State and
+    groups are this optimiser's own; the two that make the steps look at them.
+
+    Args:
+        groups: as torch takes them; the first holds the matrices (2-D), the others what is Adam's.
+        lr: learning rate of groups without one of their own.
+        momentum, weight_decay: Muon's.
+        betas, eps: Adam's.
+
+    Raises:
+        ValueError: torch is older than 2.9, the first that has Muon.
+    """
+
+    def __init__(
+        self,
+        groups: list[dict[str, Any]],
+        lr: float,
+        momentum: float = 0.95,
+        weight_decay: float = 0.0,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        if not hasattr(torch.optim, "Muon"):
+            raise ValueError("optimizer=muon needs torch 2.9 or later; take adam")
+        muon = torch.optim.Muon(
+            groups[:1],
+            lr=lr,
+            momentum=momentum,
+            weight_decay=weight_decay,
+            adjust_lr_fn="match_rms_adamw",
+        )
+        adam = torch.optim.Adam(groups[1:], lr=lr, betas=betas, eps=eps, fused=True)
+        self._parts: tuple[Optimizer, Optimizer] = (muon, adam)
+        super().__init__(muon.param_groups + adam.param_groups, {})
+        self._share()
+
+    def _share(self) -> None:
+        parted = (self.param_groups[:1], self.param_groups[1:])
+        for part, groups in zip(self._parts, parted, strict=True):
+            part.param_groups, part.state = groups, self.state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Loading a state puts new groups in the place of the old."""
+        super().__setstate__(state)
+        self._share()
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """One step of both, after the closure (loss and gradients), whose value is given back."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for part in self._parts:
+            part.step()
+        return loss
+
 
 OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
     "adam": torch.optim.Adam,
@@ -17,11 +78,16 @@ OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
     "rmsprop": torch.optim.RMSprop,
     "sgd": torch.optim.SGD,
     "lbfgs": torch.optim.LBFGS,
+    "muon": MuonBesideAdam,
 }
 # those that torch offers as one operation for all parameters
 _FUSED = ("adam", "adamw", "sgd")
 # those that take one group of parameters, and so one learning rate
 _WHOLE = ("lbfgs",)
+# those whose first group is of the hidden layers' matrices alone
+_BY_MATRIX = ("muon",)
+# layers that give numbers that are not features of a network
+_LAST = ("output", "readout")
 Factor = Callable[[float], float]  # of the step: share of the full learning rate
 
 
@@ -80,6 +146,13 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
     if name in _WHOLE:
         others, grids = others + grids, []
     groups: list[dict[str, Any]] = [{"params": others, "name": "network"}]
+    if name in _BY_MATRIX:
+        hidden = [p for key, p in named if ".tables." not in key and _hidden_matrix(key, p)]
+        if not hidden:
+            raise ValueError(f"optimizer {name!r}: the network has no matrices; take adam")
+        taken = set(map(id, hidden))
+        groups[0]["params"] = [p for p in others if id(p) not in taken]
+        groups.insert(0, {"params": hidden, "name": "matrices"})
     if grids:
         groups.append({"params": grids, "lr": encoding_lr or rest["lr"], "name": "encoding"})
     if name in _FUSED and not rest.get("foreach"):
@@ -88,6 +161,10 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
         return OPTIMIZERS[name](groups, **rest)
     except TypeError as error:
         raise ValueError(f"optimizer {name!r}: {error}") from error
+
+
+def _hidden_matrix(key: str, p: Tensor) -> bool:
+    return p.ndim == 2 and not any(part in _LAST for part in key.split("."))
 
 
 def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: int) -> LRScheduler:

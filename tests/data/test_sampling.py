@@ -1,5 +1,7 @@
 """Samples: uniform by area, on the surface, a function of (seed, step)."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -44,6 +46,18 @@ def test_uniform_by_area_not_by_face(uneven):
     # both halves have the same area, though one has ten times the faces
     share = float((points[:, 0] < 0).float().mean())
     assert share == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_share_uniform_in_the_domain_has_the_mixed_density(uneven):
+    """Of a layout that gives three quarters of Ω to the left half of the rectangle."""
+    x = uneven.vertices[:, 0] / uneven.vertices[:, 0].max()
+    u = np.where(x < 0, 0.5 + 1.5 * x, 0.5 + 0.5 * x)
+    surface = dataclasses.replace(uneven, uv=np.stack([u, uneven.vertices[:, 1]], axis=1))
+    sampler = SurfaceSampler(surface)
+    for share in (0.0, 0.4, 1.0):
+        points = sampler.draw(40_000, 0.0, sampler.generator(0), domain_share=share).points
+        left = float((points[:, 0] < 0).float().mean())
+        assert left == pytest.approx(0.5 * (1 - share) + 0.75 * share, abs=0.01)
 
 
 def test_samples_lie_on_the_surface_with_its_normals(uneven):

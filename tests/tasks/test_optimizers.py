@@ -72,6 +72,73 @@ def test_cosine_is_half_a_wave():
     assert lr == pytest.approx([0.5 * (1 + math.cos(math.pi * k / 10)) for k in range(10)])
 
 
+def with_gradients(optimizer, network, steps):
+    """Steps on a loss that moves every parameter."""
+    for k in range(steps):
+        optimizer.zero_grad()
+        sum(((1 + k) * p - 1).square().sum() for p in network.parameters()).backward()
+        optimizer.step()
+
+
+def test_muon_takes_the_matrices_of_hidden_layers_and_adam_the_rest():
+    torch.manual_seed(0)
+    shape = {"width": 8, "depth": 2, "readout": "linear", "encoding": {"name": "spline_grid"}}
+    network = build_map(shape)
+    settings = {"name": "muon", "lr": 1e-3, "encoding_lr": 1e-2}
+    optimizer = build_optimizer(network, settings)
+    assert [group["name"] for group in optimizer.param_groups] == [
+        "matrices",
+        "network",
+        "encoding",
+    ]
+    before = {key: p.detach().clone() for key, p in network.named_parameters()}
+    with_gradients(optimizer, network, 1)
+    moved = {key: (p - before[key]).detach() for key, p in network.named_parameters()}
+    matrices = {f"blocks.{k}.{part}.weight" for k in (0, 1) for part in ("first", "second")}
+    matrices.add("input.weight")
+    assert matrices < set(moved)
+    for key, move in moved.items():
+        if key in matrices:  # 0.2 lr √max(A, B) times a matrix whose singular values are near 1
+            step = torch.linalg.svdvals(move)[0] / (0.2e-3 * max(move.shape) ** 0.5)
+            assert 0.6 < float(step) < 1.4
+        else:  # Adam's first step has the rate's length in each entry
+            rate = 1e-2 if ".tables." in key else 1e-3
+            assert torch.allclose(move.abs(), torch.tensor(rate), rtol=1e-2)
+
+
+def test_muon_goes_on_from_its_state_as_if_never_stopped(tmp_path):
+    settings = {"name": "muon", "lr": 1e-2, "encoding_lr": 3e-2, "betas": [0.9, 0.99]}
+    plan = {"name": "cosine", "warmup": 2}
+
+    def start():
+        torch.manual_seed(0)
+        network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
+        optimizer = build_optimizer(network, settings)
+        return network, optimizer, build_scheduler(optimizer, plan, 20)
+
+    def go_on(network, optimizer, scheduler, steps):
+        for _ in range(steps):
+            with_gradients(optimizer, network, 1)
+            scheduler.step()
+
+    whole, first, second = start(), start(), start()
+    go_on(*whole, 10)
+    go_on(*first, 5)
+    torch.save([part.state_dict() for part in first], tmp_path / "state.pt")
+    for part, state in zip(
+        second, torch.load(tmp_path / "state.pt", weights_only=True), strict=True
+    ):
+        part.load_state_dict(state)
+    go_on(*second, 5)
+    for a, b in zip(whole[0].parameters(), second[0].parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_muon_without_matrices_is_refused():
+    with pytest.raises(ValueError, match="no matrices"):
+        build_optimizer(torch.nn.LayerNorm(3), {"name": "muon", "lr": 1e-3})
+
+
 def test_lbfgs_solves_a_quadratic_with_grids_and_network_as_one():
     network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
     settings = {"name": "lbfgs", "lr": 1.0, "max_iter": 50, "line_search_fn": "strong_wolfe"}
