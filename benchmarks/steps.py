@@ -86,6 +86,8 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "default": [],
         "default, seed 1": ["seed=1"],
         "default, seed 2": ["seed=2"],
+        # of a mesh whose other rows were made on a layout that is no longer what is made
+        "default, new layout": [],
         "paper": ["experiment=paper"],
     },
     "encoding": {
