@@ -1,0 +1,51 @@
+"""The trials of benchmarks/steps.py keep their meaning, and what was made of them is found."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from nsm.config import compose_config
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+import steps  # noqa: E402
+
+EVERY = {key: changes for trials in steps.TRIALS.values() for key, changes in trials.items()}
+OTHER_DEFAULT = [
+    "map.readout=linear",
+    "map.width=128",
+    "encoding.resolutions=[32,128,512]",
+    "optimizer.lr=1e-4",
+    "energy.lambda_normal=0",
+    "data.batch_size=2048",
+    "data.vertex_share=0",
+    "data.domain_share=1",
+    "scheduler.warmup=0",
+]
+
+
+def test_the_base_is_in_force_whatever_the_default():
+    assert compose_config([*OTHER_DEFAULT, *steps.in_full([])]) == compose_config(steps.in_full([]))
+
+
+@pytest.mark.parametrize(
+    ("trial", "key", "value"),
+    [
+        ("fitted, Fourier, 64", "encoding", {"name": "fourier", "features": 64, "sigma": 2.0}),
+        ("no normals", "energy", {"lambda_normal": 0.0}),
+        ("grid of degree 3", "map.readout", "none"),
+    ],
+)
+def test_a_change_takes_the_place_of_the_base(trial, key, value):
+    assert OmegaConf.select(compose_config(steps.in_full(EVERY[trial])), key) == value
+
+
+def test_every_result_is_of_a_trial():
+    slugs = [steps.slug(key) for key in EVERY]
+    assert len(set(slugs)) == len(slugs)
+    made = {file.stem for file in steps.RESULTS.glob("*/*.json")}
+    assert made <= set(slugs)
+    assert sum(len(found) for found in steps.results().values()) == len(
+        list(steps.RESULTS.glob("*/*.json"))
+    )
