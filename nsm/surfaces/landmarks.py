@@ -142,9 +142,9 @@ def listed(given: Any, what: str) -> Landmarks:
     """
     if isinstance(given, np.ndarray):
         given = given.tolist()
-    given = list(given) if isinstance(given, (list, tuple)) else given
-    if not isinstance(given, list):
+    if not isinstance(given, Sequence) or isinstance(given, (str, bytes)):
         raise NsmError(f"{what}: not a list of landmarks")
+    given = list(given)
     if all(isinstance(x, (int, np.integer)) and not isinstance(x, bool) for x in given):
         return [int(x) for x in given]
     try:
