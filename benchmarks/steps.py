@@ -88,6 +88,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "default, seed 2": ["seed=2"],
         # of a mesh whose other rows were made on a layout that is no longer what is made
         "default, new layout": [],
+        "default, new layout, seed 1": ["seed=1"],
         "paper": ["experiment=paper"],
     },
     "encoding": {
@@ -164,6 +165,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "Adam, one rate": ["optimizer.encoding_lr=3e-3"],
         "Adam, β₂ = 0.999": ["optimizer.betas=[0.9,0.999]"],
         "Muon": ["optimizer=muon"],
+        "Muon, seed 1": ["optimizer=muon", "seed=1"],
         "Muon, rates a third": [
             "optimizer=muon",
             "optimizer.lr=1e-3",
