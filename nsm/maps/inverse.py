@@ -28,24 +28,28 @@ def inverted(h: nn.Module, targets: Tensor, start: Tensor, onto: str | None = No
             makes of it.
     """
     x = start.clone()
+    moving = torch.arange(len(x), device=x.device)
     for _ in range(_STEPS):
-        value, jacobian = cast(PointMap, h).value_and_jacobian(x)
-        off = targets - value
+        value, jacobian = cast(PointMap, h).value_and_jacobian(x[moving])
+        off = targets[moving] - value
         distance = off.norm(dim=1)
         safe = torch.linalg.det(jacobian).abs() > 1e-12
         identity = torch.eye(2, dtype=x.dtype, device=x.device)
         step = torch.linalg.solve(torch.where(safe[:, None, None], jacobian, identity), off)
-        best = x
-        scale = torch.ones_like(distance)
-        nearer = torch.zeros_like(safe)
+        left = (distance >= _EXACT).nonzero()[:, 0]
+        moved = torch.zeros_like(safe)
         for _ in range(_HALVINGS):
-            trial = _kept(x + scale[:, None] * step, onto)
-            now = ~nearer & ((targets - h(trial)).norm(dim=1) < distance)
-            best = torch.where(now[:, None], trial, best)
-            nearer |= now
-            scale = _SHRINK * scale
-        x = best
-        if distance.max() < _EXACT or not nearer.any():
+            if len(left) == 0:
+                break
+            index = moving[left]
+            trial = _kept(x[index] + step[left], onto)
+            now = (targets[index] - h(trial)).norm(dim=1) < distance[left]
+            x[index[now]] = trial[now]
+            moved[left[now]] = True
+            left = left[~now]
+            step[left] *= _SHRINK
+        moving = moving[moved]  # one that no step helps would only try the same again
+        if len(moving) == 0:
             break
     return x
 

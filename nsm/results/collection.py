@@ -27,6 +27,7 @@ FORMAT = "nsm-collection"
 VERSION = 1
 STEM = "collection"
 _CYCLE_EVERY = 7  # vertices, of which one is taken
+_CHUNK = 16_384  # vertices whose way back is found at once
 _MOST_CYCLES = 60  # there are k³ of them
 
 
@@ -50,6 +51,7 @@ class SurfaceCollection:
     config: dict[str, Any] = field(default_factory=dict)
     corrections: dict[tuple[int, int], Correction] = field(default_factory=dict)
     _made: dict[tuple[int, int], SurfaceMap] = field(default_factory=dict, repr=False)
+    _back: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.surfaces)
@@ -93,7 +95,12 @@ class SurfaceCollection:
         ids = self.landmarks[:, [source, target]]
         ends = self.surfaces[source], self.surfaces[target]
         correction = self.corrections.get((source, target), Correction())
-        return SurfaceMap(*ends, h.eval(), ids, {}, self.config, correction)
+        result = SurfaceMap(*ends, h.eval(), ids, {}, self.config, correction)
+        if source not in self._back:  # of a surface's k - 1 maps the part that takes longest
+            uv = torch.as_tensor(self.surfaces[source].surface.uv)
+            self._back[source] = torch.cat([h.back(part) for part in uv.split(_CHUNK)]).numpy()
+        result.__dict__["image_uv"] = correction.of(evaluate(h.second, self._back[source]))
+        return result
 
     def save(self, folder: str | Path) -> None:
         """Write the maps into a folder, and each surface into ``surface_0``, ... there.
