@@ -36,7 +36,7 @@ bench-maps: .venv/.nsm-dev
 bench-activation: .venv/.nsm-dev
 	$(BIN)/python benchmarks/activation.py $(if $(MESHES),--meshes $(MESHES))
 
-# The command on hostile meshes, files and disks: about half an hour on two cores.
+# The command on hostile meshes, files and disks: ten minutes on two cores.
 torture: .venv/.nsm-dev
 	$(BIN)/python benchmarks/torture
 
