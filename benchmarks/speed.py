@@ -38,6 +38,7 @@ from nsm.pipeline.param import build_param
 from nsm.results import NeuralSurface, atomic_write
 from nsm.surfaces import Surface
 from nsm.surfaces.shapes import ring_mesh
+from nsm.surfaces.surface import as_it_lies
 from nsm.surfaces.together import matched_landmarks
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.weakest import Weakest
@@ -80,17 +81,7 @@ def dome(rings: int = 30, height: float = 0.5) -> Surface:
     """A bulging disc."""
     uv, faces = ring_mesh(rings)
     vertices = np.column_stack([uv, height * (1 - (uv**2).sum(axis=1))])
-    return Surface(
-        name="dome",
-        vertices=vertices,
-        faces=faces,
-        uv=uv,
-        domain="disc",
-        source_vertex=np.arange(len(uv)),
-        twins=np.zeros((0, 2), dtype=np.int64),
-        scale=1.0,
-        center=np.zeros(3),
-    )
+    return as_it_lies("dome", vertices, faces, uv, "disc")
 
 
 def config_of(task: str, settings: str) -> DictConfig:

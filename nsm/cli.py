@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nsm.config import checked, conf_folder, one_line, register_resolvers
 from nsm.errors import NsmError, of_disk
+from nsm.folders import remove_empty
 from nsm.plugins import import_plugins
 from nsm.sweeps import OUTCOMES, summary
 
@@ -42,23 +43,13 @@ def _run(config: DictConfig) -> bool:
         _say("not enough memory; give a smaller mesh, network or data.batch_size")
         return False
     except OSError as error:  # a disk that is full or read-only, a folder that may not be written
-        _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
+        _say_of_disk(error)
         return False
     finally:
-        _leave_no_empty(folder)
+        here = Path.cwd()
+        if folder != here:  # folders around it that are not within are not Hydra's, and stay
+            remove_empty([folder, *(place for place in folder.parents if here in place.parents)])
     return True
-
-
-def _leave_no_empty(folder: Path) -> None:
-    """Remove a run folder that nothing came of, and the folders around it that are empty by this.
-
-    Those outside the working directory are not Hydra's, and stay.
-    """
-    inside = [place for place in folder.parents if place.is_relative_to(Path.cwd())]
-    for place in (folder, *inside):
-        if place == Path.cwd() or not place.is_dir() or any(place.iterdir()):
-            return
-        place.rmdir()
 
 
 def main() -> None:
@@ -106,7 +97,7 @@ def _tasks() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except OSError as error:  # Hydra makes the run folder before anything of ours runs
-        _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
+        _say_of_disk(error)
         sys.exit(2)
     if not all(good):
         sys.exit(2)
@@ -122,6 +113,10 @@ def _sum_up() -> None:
         _say(f"failed: {' '.join(outcome.words) or outcome.folder}: {outcome.error}")
     if failed:
         sys.exit(1)
+
+
+def _say_of_disk(error: OSError) -> None:
+    _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
 
 
 def _say(message: str) -> None:

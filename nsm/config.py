@@ -204,7 +204,6 @@ def compose_config(overrides: Sequence[str] = ()) -> DictConfig:
         NsmError: an override that names no key or has the wrong type.
     """
     register_resolvers()
-    import_plugins()
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -36,12 +37,16 @@ class SurfaceSampler:
         double_area = cross.norm(dim=1)
         self.normals = cross / double_area.clamp_min(1e-30)[:, None]
         self.cumulative_area = _cumulative(double_area)
-        a, b, c = self.uv[self.faces].double().unbind(dim=1)
-        u, v = b - a, c - a
-        self.cumulative_domain_area = _cumulative((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).abs())
         weighted = torch.zeros_like(self.vertices)
         weighted.index_add_(0, self.faces.reshape(-1), cross.repeat_interleave(3, dim=0))
         self.vertex_normals = weighted / weighted.norm(dim=1, keepdim=True).clamp_min(1e-30)
+
+    @cached_property
+    def cumulative_domain_area(self) -> Tensor:
+        """(F,) of the triangles up to each: share of Ω."""
+        a, b, c = self.uv[self.faces].double().unbind(dim=1)
+        u, v = b - a, c - a
+        return _cumulative((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).abs())
 
     def generator(self, seed: int, step: int = 0) -> torch.Generator:
         """The source of randomness of one step: samples depend on (seed, step) and nothing else,

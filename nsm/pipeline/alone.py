@@ -9,6 +9,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from nsm.errors import NsmError
+from nsm.folders import remove_empty
 
 LOCK_FILE = ".lock"
 
@@ -36,7 +37,4 @@ def alone(folder: Path) -> Iterator[None]:
         lock.release(force=True)
         if [entry.name for entry in folder.iterdir()] == [LOCK_FILE]:
             (folder / LOCK_FILE).unlink(missing_ok=True)
-            for place in made:
-                if any(place.iterdir()):
-                    break
-                place.rmdir()
+            remove_empty(made)

@@ -125,7 +125,7 @@ def fitted(
     data: pl.LightningDataModule,
     module: Any,
     console: Console,
-    pictures: Pictures,
+    pictures: Pictures | None,
     title: str,
     *,
     resuming: bool,
@@ -144,7 +144,8 @@ def fitted(
         shown = (module.progress_figure, module.progress_form)
         callbacks.append(TrainingProgress(console, title, *shown))
     if config.logger.kinds:
-        callbacks += [LearningRateMonitor(), Throughput(config.logger.every), pictures]
+        callbacks += [LearningRateMonitor(), Throughput(config.logger.every)]
+        callbacks += [pictures] if pictures else []
     module.log_every = config.logger.every
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))

@@ -31,14 +31,7 @@ from nsm.pipeline.common import (
     write_figures,
 )
 from nsm.pipeline.overfit import run_overfit
-from nsm.results import (
-    NeuralSurface,
-    load_surface,
-    overfit_metrics,
-    reconstruction_image,
-    save_surface,
-)
-from nsm.results.callbacks import Pictures
+from nsm.results import NeuralSurface, load_surface, overfit_metrics, save_surface
 from nsm.results.files import atomic_write
 from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
@@ -86,7 +79,10 @@ def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralS
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
-    overfit = _settings_of_phi(config)
+    return _made(surface, _settings_of_phi(config), console)
+
+
+def _made(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurface:
     folder = _place_of(surface, overfit)
     with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
         if (folder / "metrics.json").exists():
@@ -111,18 +107,15 @@ def made_together(
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
     overfit = _settings_of_phi(config)
-    missing = {
-        folder: surface
-        for surface in surfaces
-        if not ((folder := _place_of(surface, overfit)) / "metrics.json").exists()
-    }
     limits = (overfit.trainer.stop_gradient_norm, overfit.trainer.gradient_clip)
-    # these look at a whole training's gradient, where each surface needs its own; and what was
-    # begun alone goes on alone
-    begun = any((folder / CHECKPOINT_FILE).exists() for folder in missing)
-    if in_one_batch and len(missing) > 1 and limits == (None, None) and not begun:
-        _fill_cache(missing, overfit, console)
-    return [made_once(surface, config, console) for surface in surfaces]
+    # these look at a whole training's gradient, where each surface needs its own
+    if in_one_batch and limits == (None, None):
+        places = {_place_of(surface, overfit): surface for surface in surfaces}
+        missing = {p: s for p, s in places.items() if not (p / "metrics.json").exists()}
+        # what was begun alone goes on alone
+        if len(missing) > 1 and not any((p / CHECKPOINT_FILE).exists() for p in missing):
+            _fill_cache(missing, overfit, console)
+    return [_made(surface, overfit, console) for surface in surfaces]
 
 
 def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Console) -> None:
@@ -164,14 +157,13 @@ def _trained_together(
         return module
 
     module = built(config, make)
-    first = surfaces[0]
     trainer = fitted(
         config,
         folder,
         SeveralData(surfaces, **plain(config)["data"], seed=config.seed),
         module,
         console,
-        Pictures("surface", lambda m: reconstruction_image(first, m.maps[0]), 0),  # type: ignore[arg-type,index]
+        None,
         f"overfit {len(surfaces)} surfaces",
         resuming=(folder / CHECKPOINT_FILE).exists(),
     )

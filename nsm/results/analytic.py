@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from nsm.maps import build_analytic
 from nsm.results.artifact import NeuralSurface
 from nsm.results.metrics import evaluate
-from nsm.surfaces import Surface
 from nsm.surfaces.shapes import grid_mesh, ring_mesh
+from nsm.surfaces.surface import as_it_lies
 
 _RINGS, _SIDE = 80, 120
 
@@ -27,15 +25,5 @@ def analytic_surface(config: dict[str, Any], domain: str) -> NeuralSurface:
     """
     psi = build_analytic(config).eval()
     uv, faces = ring_mesh(_RINGS) if domain == "disc" else grid_mesh(_SIDE)
-    surface = Surface(
-        name=psi.name,
-        vertices=evaluate(psi, uv),
-        faces=faces,
-        uv=uv,
-        domain=domain,
-        source_vertex=np.arange(len(uv)),
-        twins=np.zeros((0, 2), dtype=np.int64),
-        scale=1.0,
-        center=np.zeros(3),
-    )
+    surface = as_it_lies(psi.name, evaluate(psi, uv), faces, uv, domain)
     return NeuralSurface(surface, psi)

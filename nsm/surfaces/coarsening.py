@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from nsm.surfaces import topology
+
 # A new triangle's normal may turn by 70°, and its double area over its squared sides (0.29 if they
 # are equal) may not be below this and the old one's.
 _TURN, _SHAPE = 0.34, 0.03
@@ -68,9 +70,7 @@ def coarsen(
     rounds: list[Round] = []
     while len(alive) > count:
         present = faces[alive]
-        used = np.zeros(len(vertices), dtype=bool)
-        used[present] = True
-        ids, local = np.flatnonzero(used), np.cumsum(used) - 1
+        ids, local = topology.renumbered(present, len(vertices))
         vertex, target, before = _collapses(vertices[ids], local[present], held[ids], rng)
         if len(vertex) < _LEAST_SHARE * len(ids):
             break

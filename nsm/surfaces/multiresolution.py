@@ -47,10 +47,8 @@ def laid_out(
     """
     current, rounds = coarsen(vertices, faces, held, count)
     coarse = present_faces(current)
-    used = np.zeros(len(vertices), dtype=bool)
-    used[coarse] = True
-    ids, local = np.flatnonzero(used), np.cumsum(used) - 1
-    left = used[loop]
+    ids, local = topology.renumbered(coarse, len(vertices))
+    left = np.isin(loop, ids)
     area = topology.face_areas(vertices, faces).sum() / topology.face_areas(vertices, coarse).sum()
     uv = np.zeros((len(vertices), 2))
     points, rim_left = vertices[ids] * np.sqrt(area), local[loop[left]]

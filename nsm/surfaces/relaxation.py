@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nsm.surfaces import topology
 from nsm.surfaces.coarsening import Rings
 
 _TRIES, _SHORTER = 4, 0.35
@@ -197,9 +198,7 @@ def sweep(
         uv: (V, 2), not flipped; changed in place.
         sweeps: how often all are gone through.
     """
-    used = np.zeros(len(vertices), dtype=bool)
-    used[faces] = True
-    ids, local = np.flatnonzero(used), np.cumsum(used) - 1
+    ids, local = topology.renumbered(faces, len(vertices))
     colour = _colours(local[faces], len(ids))
     owner = faces.ravel()
     b, c = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()

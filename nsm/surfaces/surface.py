@@ -294,6 +294,28 @@ class Surface:
         return result
 
 
+def as_it_lies(
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    domain: str,
+    twins: np.ndarray | None = None,
+) -> Surface:
+    """A disc that is laid out already, in its own units and place; nothing is checked."""
+    return Surface(
+        name=name,
+        vertices=vertices,
+        faces=faces,
+        uv=uv,
+        domain=domain,
+        source_vertex=np.arange(len(uv)),
+        twins=np.zeros((0, 2), dtype=np.int64) if twins is None else twins,
+        scale=1.0,
+        center=np.zeros(3),
+    )
+
+
 def _numbers(given: Any, what: str) -> list[int]:
     """Vertex numbers; NsmError for anything else than a list of whole numbers."""
     numbers = listed(given, what)

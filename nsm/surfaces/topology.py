@@ -120,6 +120,14 @@ def is_disc(faces: np.ndarray) -> bool:
     )
 
 
+def renumbered(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of n vertices, those (N,) that faces (F, 3) name, in rising order, and the number (n,) of
+    each among them; of the others it means nothing."""
+    used = np.zeros(n, dtype=bool)
+    used[faces] = True
+    return np.flatnonzero(used), np.cumsum(used) - 1
+
+
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Areas (F,) of the triangles of a 3D mesh, in the square of its unit."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))

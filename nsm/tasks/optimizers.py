@@ -139,20 +139,18 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
     name, encoding_lr = rest.pop("name"), rest.pop("encoding_lr", None)
     if name not in OPTIMIZERS:
         raise ValueError(f"optimizer {name!r} is not one of {', '.join(OPTIMIZERS)}")
-    named = [(key, p) for key, p in module.named_parameters() if p.requires_grad]
-    grids = [p for key, p in named if ".tables." in key]
-    others = [p for key, p in named if ".tables." not in key]
+    named = {key: p for key, p in module.named_parameters() if p.requires_grad}
+    grids = [p for key, p in named.items() if ".tables." in key]
+    matrices = [key for key, p in named.items() if name in _BY_MATRIX and _hidden_matrix(key, p)]
+    others = [p for key, p in named.items() if ".tables." not in key and key not in matrices]
     # the names are those of the learning rates in the log
     if name in _WHOLE:
         others, grids = others + grids, []
     groups: list[dict[str, Any]] = [{"params": others, "name": "network"}]
     if name in _BY_MATRIX:
-        hidden = [p for key, p in named if ".tables." not in key and _hidden_matrix(key, p)]
-        if not hidden:
+        if not matrices:
             raise ValueError(f"optimizer {name!r}: the network has no matrices; take adam")
-        taken = set(map(id, hidden))
-        groups[0]["params"] = [p for p in others if id(p) not in taken]
-        groups.insert(0, {"params": hidden, "name": "matrices"})
+        groups.insert(0, {"params": [named[key] for key in matrices], "name": "matrices"})
     if grids:
         groups.append({"params": grids, "lr": encoding_lr or rest["lr"], "name": "encoding"})
     if name in _FUSED and not rest.get("foreach"):
@@ -164,7 +162,8 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
 
 
 def _hidden_matrix(key: str, p: Tensor) -> bool:
-    return p.ndim == 2 and not any(part in _LAST for part in key.split("."))
+    parts = key.split(".")
+    return p.ndim == 2 and "tables" not in parts and not any(part in _LAST for part in parts)
 
 
 def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: int) -> LRScheduler:

@@ -13,6 +13,7 @@ from nsm.data import Samples
 from nsm.energies.overfit import normal, position
 from nsm.maps import build_map, together
 from nsm.tasks.optimizers import configure
+from nsm.tasks.terms import Term
 from nsm.tasks.training import Training
 
 
@@ -50,18 +51,9 @@ class Overfit(Training):
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         if self.lambda_normal == 0:
             (value,) = self.pointwise(lambda uv: (self.map(uv),), batch.uv)
-            return self.summed({"position": (1.0, self._position(value, batch))})
+            return self.summed(_terms(value, None, batch, self.lambda_normal))
         value, jacobian = self.pointwise(self.map.value_and_jacobian, batch.uv)
-        turn = normal(jacobian, batch.normals).mean()
-        terms = {
-            "position": (1.0, self._position(value, batch)),
-            "normal": (self.lambda_normal, turn),
-        }
-        return self.summed(terms)
-
-    @staticmethod
-    def _position(value: Tensor, batch: Samples) -> Tensor:
-        return position(value, batch.points).mean()
+        return self.summed(_terms(value, jacobian, batch, self.lambda_normal))
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         value, jacobian = self.map.value_and_jacobian(batch.uv)
@@ -79,6 +71,20 @@ class Overfit(Training):
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)
+
+
+def _terms(
+    value: Tensor, jacobian: Tensor | None, batch: Samples, lambda_normal: float
+) -> dict[str, Term]:
+    """The terms of Eq. 1, that of normals where there are Jacobians (..., N, 3, 2): means over N
+    samples, summed over the surfaces where there are several."""
+    terms: dict[str, Term] = {
+        "position": (1.0, position(value, batch.points).mean(dim=-1).sum()),
+    }
+    if jacobian is not None:
+        turn = normal(jacobian, batch.normals).mean(dim=-1).sum()
+        terms["normal"] = (lambda_normal, turn)
+    return terms
 
 
 class OverfitSeveral(Training):
@@ -123,11 +129,8 @@ class OverfitSeveral(Training):
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         value, jacobian = self._evaluated(batch.uv)
-        terms = {"position": (1.0, position(value, batch.points).mean(dim=1).sum())}
-        if self.lambda_normal > 0:
-            turn = normal(jacobian, batch.normals).mean(dim=1).sum()
-            terms["normal"] = (self.lambda_normal, turn)
-        return self.summed(terms)
+        with_normals = jacobian if self.lambda_normal > 0 else None
+        return self.summed(_terms(value, with_normals, batch, self.lambda_normal))
 
     def _evaluated(self, uv: Tensor) -> tuple[Tensor, ...]:
         """Values (k, N, 3) and Jacobians (k, N, 3, 2)."""

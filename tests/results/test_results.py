@@ -25,6 +25,7 @@ from nsm.results import (
 )
 from nsm.results.render import View, rasterise
 from nsm.surfaces import Surface
+from nsm.surfaces.surface import as_it_lies
 
 
 class Affine(nn.Module):
@@ -50,17 +51,9 @@ def square(twins=()) -> Surface:
     uv = np.stack([x.ravel(), y.ravel()], axis=1)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
-    return Surface(
-        name="square",
-        vertices=np.column_stack([uv, np.zeros(len(uv))]),
-        faces=faces,
-        uv=uv,
-        domain="square",
-        source_vertex=np.arange(len(uv)),
-        twins=np.array(twins, dtype=np.int64).reshape(-1, 2),
-        scale=1.0,
-        center=np.zeros(3),
-    )
+    pairs = np.array(twins, dtype=np.int64).reshape(-1, 2)
+    vertices = np.column_stack([uv, np.zeros(len(uv))])
+    return as_it_lies("square", vertices, faces, uv, "square", pairs)
 
 
 DIAGONAL = np.sqrt(8)

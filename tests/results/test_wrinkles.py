@@ -7,6 +7,7 @@ from torch import nn
 
 from nsm.results.wrinkles import normal_variation
 from nsm.surfaces import Surface
+from nsm.surfaces.surface import as_it_lies
 
 N = 64  # squares along each side of [-1, 1]²
 U, V = np.meshgrid(np.linspace(-1, 1, N + 1), np.linspace(-1, 1, N + 1), indexing="ij")
@@ -33,17 +34,8 @@ def height(z):
 def sheet(vertices, twins=()) -> Surface:
     i = (np.arange(N)[:, None] * (N + 1) + np.arange(N)).ravel()
     halves = [np.stack([i, i + N + 1, i + N + 2], 1), np.stack([i, i + N + 2, i + 1], 1)]
-    return Surface(
-        name="sheet",
-        vertices=vertices,
-        faces=np.concatenate(halves),
-        uv=UV,
-        domain="square",
-        source_vertex=np.arange(len(UV)),
-        twins=np.array(twins, dtype=np.int64).reshape(-1, 2),
-        scale=1.0,
-        center=np.zeros(3),
-    )
+    pairs = np.array(twins, dtype=np.int64).reshape(-1, 2)
+    return as_it_lies("sheet", vertices, np.concatenate(halves), UV, "square", pairs)
 
 
 PLANE = sheet(np.column_stack([UV, np.zeros(len(UV))]))

@@ -11,6 +11,7 @@ from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
 from nsm.pipeline import build_overfit
 from nsm.results import pointwise_metrics
 from nsm.surfaces import Surface
+from nsm.surfaces.surface import as_it_lies
 from nsm.tasks.least_squares import _fit_tables, fit_readout
 
 GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}
@@ -25,17 +26,7 @@ def sheet(height) -> Surface:
     faces = np.concatenate([np.stack([a, a + 41, a + 42], 1), np.stack([a, a + 42, a + 1], 1)])
     vertices = uv @ MATRIX.T
     vertices[:, 2] += height(*uv.T)
-    return Surface(
-        name="sheet",
-        vertices=vertices,
-        faces=faces,
-        uv=uv,
-        domain="square",
-        source_vertex=np.arange(len(uv)),
-        twins=np.zeros((0, 2), dtype=np.int64),
-        scale=1.0,
-        center=np.zeros(3),
-    )
+    return as_it_lies("sheet", vertices, faces, uv, "square")
 
 
 @pytest.mark.parametrize(
