@@ -18,11 +18,13 @@ import argparse
 import json
 import platform
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from candidates import exchanged, parted
 from rich.console import Console
 from training import MESHES, Clock, surface_of, train
 
@@ -80,6 +82,16 @@ BASE: dict[str, list[str]] = {
     "trainer": ["trainer.gradient_clip=null", "trainer.precision=float32", "trainer.compile=false"],
 }
 
+# the start by least squares, and small rates from there
+START = ["map.readout=fitted", "encoding.resolutions=[32,128,512]"]
+FITTED = [*START, "optimizer.lr=1e-4", "optimizer.encoding_lr=1e-4"]
+
+GAUSS_NEWTON = ["candidate=gauss_newton", "optimizer.lr=1", "scheduler.warmup=0"]
+
+HELD = ["candidate.damping=0.1"]
+SOAP = ["optimizer=muon", "candidate=preconditioned", "candidate.kind=soap"]
+SHAMPOO = [*SOAP[:-1], "candidate.kind=shampoo"]
+
 # by topic, what is changed from BASE
 TRIALS: dict[str, dict[str, list[str]]] = {
     "default": {
@@ -107,6 +119,13 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "grid 16, 64, 256, 512": ["encoding.resolutions=[16,64,256,512]"],
         "grid 32, 128, 512": ["encoding.resolutions=[32,128,512]"],
         "grid 16, 32, 64, 128, 256": ["encoding.resolutions=[16,32,64,128,256]"],
+        "coarse to fine": ["candidate=coarse_to_fine"],
+        "coarse to fine, 16, 32, 64, 128, 256": [
+            "encoding.resolutions=[16,32,64,128,256]",
+            "candidate=coarse_to_fine",
+        ],
+        "hash grid, 8 levels to 256": ["encoding=hash_grid", "encoding.finest=256"],
+        "hash grid, 8 levels to 512": ["encoding=hash_grid"],
         "grid of 2 features": ["encoding.features=2"],
         "grid of 8 features": ["encoding.features=8"],
         "grid of degree 3": ["encoding.degree=3"],
@@ -133,6 +152,29 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         ],
         "fitted, Fourier, 64": ["map.readout=fitted", "encoding=fourier"],
     },
+    "second order": {
+        "Gauss–Newton": [*GAUSS_NEWTON, "data.batch_size=16384"],
+        "Gauss–Newton, μ ≥ 0.1": [*GAUSS_NEWTON, *HELD, "data.batch_size=16384"],
+        "Gauss–Newton, μ ≥ 0.1, batch 65,536": [*GAUSS_NEWTON, *HELD, "data.batch_size=65536"],
+        "fitted, Gauss–Newton": [*START, *GAUSS_NEWTON, "data.batch_size=16384"],
+        "fitted, Gauss–Newton, μ ≥ 0.1": [
+            *START,
+            *GAUSS_NEWTON,
+            *HELD,
+            "data.batch_size=16384",
+        ],
+        "fitted, Gauss–Newton, μ ≥ 0.1, batch 65,536": [
+            *START,
+            *GAUSS_NEWTON,
+            *HELD,
+            "data.batch_size=65536",
+        ],
+    },
+    "from the fitted start": {
+        "fitted, Muon": [*FITTED, "optimizer=muon"],
+        "fitted, L-BFGS, batch 16,384": [*START, "optimizer=lbfgs", "data.batch_size=16384"],
+        "fitted, L-BFGS, batch 65,536": [*START, "optimizer=lbfgs", "data.batch_size=65536"],
+    },
     "network": {
         "32 × 1": ["map.width=32"],
         "128 × 1": ["map.width=128"],
@@ -151,6 +193,9 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "half uniform in Ω": ["data.domain_share=0.5"],
         "a fifth uniform in Ω": ["data.domain_share=0.2"],
         "pool of 500,000": ["sampler=pool"],
+        "by error": ["candidate=by_error"],
+        "by error, not weighted": ["candidate=by_error", "candidate.weighted=false"],
+        "batch 256 to 8,192": ["candidate=growing_batch"],
         "batch 256": ["data.batch_size=256"],
         "batch 512": ["data.batch_size=512"],
         "batch 2,048": ["data.batch_size=2048"],
@@ -171,6 +216,8 @@ TRIALS: dict[str, dict[str, list[str]]] = {
             "optimizer.lr=1e-3",
             "optimizer.encoding_lr=1e-2",
         ],
+        "SOAP": SOAP,
+        "Shampoo": SHAMPOO,
         "L-BFGS, batch 16,384": ["optimizer=lbfgs", "data.batch_size=16384"],
     },
     "schedule": {
@@ -188,9 +235,14 @@ TRIALS: dict[str, dict[str, list[str]]] = {
 class OnTheClock(Clock):
     """A schedule that comes to an end does so with the budget."""
 
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent."""
+        return min(1.0, self.spent / self.budget)
+
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         def by_time(factor: Any) -> Any:
-            return lambda _: factor(STEPS * min(1.0, self.spent / self.budget))
+            return lambda _: factor(STEPS * self.progress)
 
         if pl_module.hparams["scheduler"]["name"] == "cosine":
             for configured in trainer.lr_scheduler_configs:
@@ -211,6 +263,7 @@ def in_full(changes: list[str]) -> list[str]:
 
 def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
     """Errors at the marks of one mesh's training with these overrides."""
+    words, candidate = parted(words)
     config = compose_config([*words, f"trainer.max_steps={STEPS}"])
     place = {"domain": config.domain, "parameterization": config.surface.parameterization}
     surface = surface_of(name, meshes, **place)
@@ -224,19 +277,16 @@ def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
         module.map.train()
 
     clock = OnTheClock(MARKS, at_mark)
-    module = train(config, surface, [clock], max_steps=-1)[1]
+    piece = partial(exchanged, words=candidate, progress=lambda: clock.progress)
+    module = train(config, surface, [clock], max_steps=-1, exchanged=piece)[1]
     return {"curve": curve, "wrinkles": normal_variation(surface, module.map.eval())}
 
 
 def slug(trial_name: str) -> str:
     """A trial's name as a file's."""
     plain = trial_name.replace("×", "x").replace("σ", "sigma").replace("λ", "lambda")
-    plain = (
-        plain.replace("β₂", "beta2")
-        .replace("Ω", "domain")
-        .replace("500,000", "500000")
-        .replace("16,384", "16384")
-    )
+    plain = plain.replace("β₂", "beta2").replace("Ω", "domain").replace("μ ≥", "mu")
+    plain = re.sub(r"(?<=\d\d),(?=\d{3})", "", plain)
     return re.sub(r"[^a-z0-9.=]+", "-", plain.lower()).strip("-")
 
 

@@ -15,6 +15,7 @@ from pytorch_lightning.callbacks import Callback
 from nsm.data import OverfitData
 from nsm.pipeline import build_overfit
 from nsm.surfaces import Surface
+from nsm.tasks import Overfit
 
 MESHES = {
     "cow": "cow.obj",
@@ -58,6 +59,7 @@ def train(
     surface: Surface,
     callbacks: list[Callback],
     max_steps: int | None = None,
+    exchanged: Callable[[Overfit], Overfit] = lambda module: module,
 ) -> tuple[pl.Trainer, Any, float]:
     """The trainer, the module and the seconds of the CPU that the training took.
 
@@ -65,10 +67,12 @@ def train(
         config, surface: what is trained.
         callbacks: of Lightning.
         max_steps: after which the training ends, -1 for never; without it where its schedule does.
+        exchanged: from the product's module to the one that is trained.
     """
     start = time.process_time()
-    module = build_overfit(config, surface)
-    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=config.seed)
+    module = exchanged(build_overfit(config, surface))
+    samples = getattr(module, "samples", OverfitData)
+    data = samples(surface, **OmegaConf.to_container(config.data), seed=config.seed)
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
             accelerator="cpu",

@@ -1,0 +1,512 @@
+"""Pieces that trials of steps.py put in the place of the product's: none is a setting of nsm.
+
+Each candidate is the task of overfitting with one piece exchanged. The words of a trial name it as
+``candidate=NAME``, with ``candidate.SETTING=VALUE``; an encoding is registered, as users' own are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from scipy.sparse import csr_matrix
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+import nsm
+from nsm.data import OverfitData, Samples, SurfaceSampler
+from nsm.energies.overfit import NORMAL_FLOOR, normal, position
+from nsm.maps import NeuralMap, SplineGrid
+from nsm.maps.encodings import pushed_forward, value_and_jacobian_stack
+from nsm.maps.networks import read_out
+from nsm.surfaces import Surface
+from nsm.tasks import Overfit
+from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer, build_scheduler
+
+
+class Candidate(Overfit):
+    """Overfitting with a piece exchanged.
+
+    Attributes:
+        samples: the samples that it is trained on.
+        progress: share of the budget that is spent, in [0, 1].
+    """
+
+    samples: type[OverfitData] = OverfitData
+    progress: Callable[[], float]
+
+    def optimizer(self) -> Optimizer:
+        """The optimiser in the product's place."""
+        return build_optimizer(self.map, dict(self.hparams["optimizer"]))
+
+    def configure_optimizers(self) -> Any:
+        optimizer = self.optimizer()
+        settings = dict(self.hparams["scheduler"])
+        scheduler = build_scheduler(optimizer, settings, self.hparams["max_steps"])
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
+
+
+# Second order: Gauss–Newton steps, damped
+
+
+class _Times(torch.autograd.Function):
+    """A X (rows, m) of a sparse matrix A, which can be differentiated as often as is wanted."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: csr_matrix, x: Tensor) -> Tensor:
+        ctx.matrix = matrix
+        return torch.from_numpy(matrix @ x.numpy())
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # type: ignore[override]
+        return None, _Times.apply(ctx.matrix.T, gradient)
+
+
+def _features(encoding: Any, uv: Tensor) -> Tensor:
+    """Value and both tangents of features (3, N, out_dim); a grid's tables are parameters."""
+    if not isinstance(encoding, SplineGrid):
+        return value_and_jacobian_stack(encoding, uv).detach()
+    parts = [torch.cat([uv[None], torch.eye(2).to(uv)[:, None].expand(-1, len(uv), -1)])]
+    for level, table in enumerate(encoding.tables):
+        rows, weights = encoding.seen(uv, level)
+        taps = rows.shape[1]
+        each = np.arange(0, 3 * len(uv) * taps + 1, taps)
+        seen = rows.repeat(3, 1).flatten().numpy()
+        matrix = csr_matrix((weights.flatten().numpy(), seen, each), (3 * len(uv), len(table)))
+        parts.append(_Times.apply(matrix, table).view(3, len(uv), -1))
+    return torch.cat(parts, dim=-1)
+
+
+def residuals(network: NeuralMap, batch: Samples, lambda_normal: float) -> Tensor:
+    """r (6 N,) with ‖r‖² the loss of Eq. 1 on a batch, differentiable twice by the parameters.
+
+    Args:
+        network: φ of plain blocks.
+        batch: N samples.
+        lambda_normal: λ_n.
+    """
+    stack = features = _features(network.encoding, batch.uv)
+    for layer in network.layers[:-1]:
+        z = stack @ layer.weight.T
+        z = torch.cat([z[:1] + layer.bias, z[1:]])
+        stack = pushed_forward(network.activation, z)
+    stack = read_out(stack[..., :0].new_zeros(3, len(batch.uv), 3), stack, *_of(network.output))
+    if network.readout is not None:
+        stack = read_out(stack, features, *_of(network.readout))
+    cross = torch.linalg.cross(stack[1], stack[2])
+    turned = cross / (cross.square().sum(dim=1, keepdim=True) + NORMAL_FLOOR).sqrt()
+    parts = [stack[0] - batch.points, math.sqrt(lambda_normal) * (turned - batch.normals)]
+    return torch.cat([part.flatten() for part in parts]) / math.sqrt(len(batch.uv))
+
+
+def _of(layer: nn.Linear) -> tuple[Tensor, Tensor]:
+    return layer.weight, layer.bias
+
+
+class Products:
+    """J v and Jᵀ u, without J (M, P), of residuals r (M,) by P parameters.
+
+    Jᵀ u is a backward pass; J v one through that pass, which is linear in u.
+
+    Args:
+        residual: (M,), with the graph that it came by, twice differentiable.
+        parameters: in the order in which vectors v hold theirs.
+    """
+
+    def __init__(self, residual: Tensor, parameters: Sequence[Tensor]) -> None:
+        self.residual, self.parameters = residual, list(parameters)
+        self.dual = torch.zeros_like(residual, requires_grad=True)
+        self.pulled = torch.autograd.grad(residual, self.parameters, self.dual, create_graph=True)
+
+    def push(self, v: Tensor) -> Tensor:
+        """J v (M,) of v (P,)."""
+        parts = v.split([p.numel() for p in self.parameters])
+        shaped = [part.view_as(p) for part, p in zip(parts, self.parameters, strict=True)]
+        return torch.autograd.grad(self.pulled, self.dual, shaped, retain_graph=True)[0]
+
+    def pull(self, u: Tensor) -> Tensor:
+        """Jᵀ u (P,) of u (M,)."""
+        pulled = torch.autograd.grad(self.residual, self.parameters, u, retain_graph=True)
+        return torch.cat([part.flatten() for part in pulled])
+
+
+class LevenbergMarquardt(Optimizer):
+    """(JᵀJ + μ D) x = −Jᵀ r by conjugate gradients, D the diagonal of JᵀJ; a step is rate · x.
+
+    D is estimated by E[(Jᵀu)²], u of random signs, over all steps so far. μ follows the ratio of
+    the decrease that came to the one that the linear model promised, on the step's own batch; a
+    step that makes the loss larger there is taken back.
+
+    Args:
+        parameters: as torch takes them.
+        residual: r of the parameters as they are, on the batch that the closure was of.
+        lr: share of a step that is made.
+        iterations: of conjugate gradients.
+        damping: the first μ, and the least.
+        probes: vectors u a step.
+    """
+
+    def __init__(
+        self,
+        parameters: Any,
+        residual: Callable[[], Tensor],
+        lr: float,
+        iterations: int,
+        damping: float,
+        probes: int,
+    ) -> None:
+        super().__init__(parameters, {"lr": lr})
+        self.residual, self.iterations, self.probes = residual, iterations, probes
+        self.damping = self.least = damping
+        self.squares: Tensor | float = 0.0
+        self.probed = 0
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        assert closure is not None
+        with torch.enable_grad():
+            value = closure()
+            (group,) = self.param_groups
+            products = Products(self.residual(), group["params"])
+        residual = products.residual.detach()
+        for _ in range(self.probes):
+            sign = torch.randint(0, 2, residual.shape).to(residual).mul_(2).sub_(1)
+            self.squares = self.squares + products.pull(sign).square()
+        self.probed += self.probes
+        diagonal = self.squares / self.probed
+        # what no sample has seen so far stays where it is
+        diagonal = diagonal + 1e-6 * diagonal.mean()
+        right = -products.pull(residual)
+        x, promised = self._solved(products, diagonal, right)
+        before = float(residual.square().sum())
+        with torch.no_grad():
+            start = [p.clone() for p in group["params"]]
+            parts = x.split([p.numel() for p in start])
+            for p, part in zip(group["params"], parts, strict=True):
+                p.add_(part.view_as(p))
+            came = before - float(self.residual().square().sum())
+            for p, old in zip(group["params"], start, strict=True):
+                p.copy_(torch.lerp(old, p, group["lr"]) if came > 0 else old)
+        if came < 0.25 * promised:
+            self.damping *= 4
+        elif came > 0.75 * promised:
+            self.damping = max(self.damping / 3, self.least)
+        return value
+
+    def _solved(self, products: Products, diagonal: Tensor, right: Tensor) -> tuple[Tensor, float]:
+        """x, and by how much the linear model of the loss is less there."""
+        held = self.damping * diagonal
+        scale = 1 / (diagonal + held)
+        x, left = torch.zeros_like(right), right.clone()
+        guess = scale * left
+        direction, product = guess.clone(), left @ guess
+        for _ in range(self.iterations):
+            image = products.pull(products.push(direction)) + held * direction
+            length = product / (direction @ image)
+            x += length * direction
+            left -= length * image
+            guess = scale * left
+            before, product = product, left @ guess
+            direction = guess + product / before * direction
+        return x, float(x @ right + x @ left + x @ (held * x))
+
+
+class GaussNewton(Candidate):
+    """Steps of :class:`LevenbergMarquardt` on the loss of Eq. 1, by all parameters."""
+
+    def __init__(
+        self, iterations: int = 10, damping: float = 1e-3, probes: int = 2, **task: Any
+    ) -> None:
+        super().__init__(**task)
+        self.inner = {"iterations": iterations, "damping": damping, "probes": probes}
+
+    def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        self.batch = batch
+        return super().training_step(batch, batch_idx)
+
+    def optimizer(self) -> Optimizer:
+        lr = self.hparams["optimizer"]["lr"]
+        return LevenbergMarquardt(
+            self.map.parameters(),
+            lambda: residuals(self.map, self.batch, self.lambda_normal),
+            lr=lr,
+            **self.inner,
+        )
+
+
+# Optimisers of matrices, in Muon's place beside Adam
+
+
+class Beside(MuonBesideAdam):
+    """Another optimiser in Muon's place, with Adam for all else.
+
+    Args:
+        muon: what it is like.
+        make: from the group of the matrices to the optimiser.
+    """
+
+    def __init__(
+        self, muon: MuonBesideAdam, make: Callable[[list[dict[str, Any]]], Optimizer]
+    ) -> None:
+        matrices, *others = muon.param_groups
+        other = make([{key: matrices[key] for key in ("params", "name", "lr")}])
+        self._parts = (other, muon._parts[1])
+        Optimizer.__init__(self, other.param_groups + others, {})
+        self._share()
+
+
+class Preconditioned(Candidate):
+    """SOAP or Shampoo for the hidden layers' matrices; grids, biases and the output are Adam's.
+
+    A grid's table has a row for each of up to 264,196 points, too many for a preconditioner.
+    """
+
+    def __init__(self, kind: str = "soap", every: int = 10, **task: Any) -> None:
+        super().__init__(**task)
+        self.kind, self.every = kind, every
+
+    def optimizer(self) -> Optimizer:
+        import pytorch_optimizer
+
+        settings = dict(self.hparams["optimizer"])
+        muon = build_optimizer(self.map, settings)
+        assert isinstance(muon, MuonBesideAdam)
+
+        def make(groups: list[dict[str, Any]]) -> Optimizer:
+            if self.kind == "soap":
+                return pytorch_optimizer.SOAP(
+                    groups,
+                    lr=settings["lr"],
+                    betas=(0.95, 0.95),
+                    weight_decay=0.0,
+                    precondition_frequency=self.every,
+                )
+            return pytorch_optimizer.ScalableShampoo(
+                groups,
+                lr=settings["lr"],
+                betas=muon.param_groups[1]["betas"],
+                start_preconditioning_step=self.every,
+                preconditioning_compute_steps=self.every,
+                graft_type=4,  # steps of RMSProp's length
+            )
+
+        return Beside(muon, make)
+
+
+# Samples
+
+
+class Weighted(NamedTuple):
+    """:class:`nsm.data.Samples` with their faces (N,) and the weights (N,) of their errors."""
+
+    uv: Tensor
+    points: Tensor
+    normals: Tensor
+    face: Tensor
+    weight: Tensor
+
+
+class ErrorSampler(SurfaceSampler):
+    """Draws points by area times 1 − share + share · e/ē, e a running error of each triangle, ē
+    its mean by area.
+
+    Args:
+        surface: the prepared surface.
+        share: of the points that are drawn by error, in [0, 1).
+        decay: what a new error counts beside the old.
+    """
+
+    def __init__(self, surface: Surface, share: float = 0.5, decay: float = 0.3) -> None:
+        super().__init__(surface)
+        self.share, self.decay = share, decay
+        self.area = torch.diff(self.cumulative_area, prepend=torch.zeros(1))
+        self.error = torch.ones(len(self.faces), dtype=torch.float64)  # relative to the mean
+
+    def weighted(self, count: int, generator: torch.Generator) -> Weighted:
+        """``count`` points, with the weights that make their mean one by area."""
+        more = 1 - self.share + self.share * self.error / (self.area @ self.error)
+        face, places = self._places(count, generator, (self.area * more).cumsum(0))
+        return Weighted(*self._at(face, places), face, (1 / more[face]).float())
+
+    def seen(self, face: Tensor, error: Tensor, weight: Tensor) -> None:
+        """Errors (N,) of samples, whose mean by area is that of error · weight."""
+        relative = (error / (error * weight).mean()).double()
+        self.error[face] = torch.lerp(self.error[face], relative, self.decay)
+
+
+class ByError(Candidate):
+    """Half of the samples drawn by current error, the rest by area; no vertices among them.
+
+    Args:
+        weighted: whether errors are weighted so that their mean is that by area.
+    """
+
+    class samples(OverfitData):  # noqa: N801
+        def setup(self, stage: str | None = None) -> None:
+            super().setup(stage)
+            self.sampler = ErrorSampler(self.surface)
+
+        def batch(self, step: int) -> Any:
+            assert isinstance(self.sampler, ErrorSampler)
+            generator = self.sampler.generator(self.seed, step)
+            return self.sampler.weighted(self.batch_size, generator)
+
+    def __init__(self, weighted: bool = True, **task: Any) -> None:
+        super().__init__(**task)
+        self.weighted = weighted
+
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        value, jacobian = self.map.value_and_jacobian(batch.uv)
+        squared = position(value, batch.points)
+        squared = squared + self.lambda_normal * normal(jacobian, batch.normals)
+        sampler = self.trainer.datamodule.sampler  # type: ignore[attr-defined]
+        sampler.seen(batch.face, squared.detach().sqrt(), batch.weight)
+        return (squared * batch.weight if self.weighted else squared).mean()
+
+
+class GrowingBatch(Candidate):
+    """Batches that grow by a constant factor over the training.
+
+    Args:
+        first, last: their sizes.
+    """
+
+    def __init__(self, first: int = 256, last: int = 8192, **task: Any) -> None:
+        super().__init__(**task)
+        self.first, self.last = first, last
+
+    def on_train_batch_start(self, batch: Samples, batch_idx: int) -> None:
+        size = self.first * (self.last / self.first) ** self.progress()
+        self.trainer.datamodule.batch_size = round(size)  # type: ignore[attr-defined]
+
+
+# Encodings
+
+
+class CoarseToFine(Candidate):
+    """Levels of the grid released one after the other; those to come are zero and stay so.
+
+    Args:
+        until: share of the training by which the last one is released; each takes an equal part.
+    """
+
+    def __init__(self, until: float = 0.4, **task: Any) -> None:
+        super().__init__(**task)
+        self.until = until
+
+    def _held(self) -> Iterator[nn.Parameter]:
+        tables = list(self.map.encoding.tables)  # type: ignore[attr-defined]
+        for level, table in enumerate(tables[1:], start=1):
+            if self.progress() < self.until * level / (len(tables) - 1):
+                yield table
+
+    def on_fit_start(self) -> None:
+        for table in self._held():
+            nn.init.zeros_(table)
+
+    def on_train_batch_start(self, batch: Samples, batch_idx: int) -> None:
+        held = {id(table) for table in self._held()}
+        for table in self.map.encoding.tables:  # type: ignore[attr-defined]
+            table.requires_grad_(id(table) not in held)
+
+
+class HashGrid(nn.Module):
+    """Multi-resolution hash encoding of the plane (Müller et al., SIGGRAPH 2022): C⁰ alone.
+
+    Args:
+        in_dim: 2.
+        levels: how many, their cells a side in geometric progression.
+        coarsest, finest: cells a side of the first and of the last.
+        features: of each level; ``out_dim`` is ``2 + levels * features``.
+        log2_rows: of the table of a level; one that needs more is hashed.
+        extent: half the side of the square that is covered; x outside is clamped to its rim.
+    """
+
+    def __init__(
+        self,
+        in_dim: int,
+        levels: int = 8,
+        coarsest: int = 16,
+        finest: int = 512,
+        features: int = 2,
+        log2_rows: int = 14,
+        extent: float = 1.05,
+    ) -> None:
+        super().__init__()
+        growth = (finest / coarsest) ** (1 / max(1, levels - 1))
+        self.cells = [round(coarsest * growth**level) for level in range(levels)]
+        self.extent, self.features = extent, features
+        rows = [min((cells + 1) ** 2, 2**log2_rows) for cells in self.cells]
+        self.rows, self.offsets = rows, [sum(rows[:level]) for level in range(levels)]
+        # the tables of all levels, one below the other
+        self.tables = nn.ParameterList([nn.Parameter(1e-2 * torch.randn(sum(rows), features))])
+        self.out_dim = in_dim + levels * features
+
+    def _places(self, corner: Tensor) -> Tensor:
+        """Rows (L, n) of the table that hold grid points (L, n, 2)."""
+        cells, rows, offsets = (
+            torch.tensor(each)[:, None] for each in (self.cells, self.rows, self.offsets)
+        )
+        direct = corner[..., 0] * (cells + 1) + corner[..., 1]
+        hashed = (corner[..., 0] ^ (corner[..., 1] * 2_654_435_761)) % rows
+        return offsets + torch.where((cells + 1) ** 2 <= rows, direct, hashed)
+
+    def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
+        """Value and both tangents, stacked: (3, N, out_dim)."""
+        cells = torch.tensor(self.cells)[:, None, None].to(x)
+        per_unit = cells / (2 * self.extent)
+        z = (x + self.extent) * per_unit  # (L, N, 2)
+        cell = z.detach().floor().clamp(min=0).minimum(cells - 1)
+        offset = (z - cell).clamp(0, 1)
+        within = (offset == z - cell) * per_unit
+        out: Tensor | float = 0.0
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            rows = self._places(cell.long() + torch.tensor([i, j]))
+            u, v = (offset[..., k] if bit else 1 - offset[..., k] for k, bit in enumerate((i, j)))
+            du, dv = within[..., 0] * (2 * i - 1), within[..., 1] * (2 * j - 1)
+            weights = torch.stack([u * v, du * v, u * dv])
+            found = self.tables[0].index_select(0, rows.flatten()).view(*rows.shape, -1)
+            out = out + weights[..., None] * found  # (3, L, N, F)
+        assert isinstance(out, Tensor)
+        unit = torch.eye(2).to(x)[:, None].expand(-1, len(x), -1)
+        return torch.cat([torch.cat([x[None], unit]), out.transpose(1, 2).flatten(2)], dim=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.value_and_jacobian_stack(x)[0]
+
+
+nsm.register_encoding("hash_grid", HashGrid)
+
+CANDIDATES: dict[str, type[Candidate]] = {
+    "gauss_newton": GaussNewton,
+    "preconditioned": Preconditioned,
+    "by_error": ByError,
+    "growing_batch": GrowingBatch,
+    "coarse_to_fine": CoarseToFine,
+}
+
+
+def parted(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A trial's words for nsm, and those for its candidate."""
+    own = [word for word in words if word.startswith(("candidate=", "candidate."))]
+    return [word for word in words if word not in own], own
+
+
+def exchanged(module: Overfit, words: Sequence[str], progress: Callable[[], float]) -> Overfit:
+    """The task as the words of a candidate have it; without any as it is."""
+    if not words:
+        return module
+    name, *rest = words
+    settings = OmegaConf.to_container(
+        OmegaConf.from_dotlist([word.removeprefix("candidate.") for word in rest])
+    )
+    assert isinstance(settings, dict)
+    other = CANDIDATES[name.removeprefix("candidate=")](**module.hparams, **settings)
+    other.map, other.progress = module.map, progress
+    return other

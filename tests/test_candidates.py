@@ -1,0 +1,216 @@
+"""The pieces of benchmarks/candidates.py are what they are said to be."""
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pytorch_lightning.callbacks import Callback
+
+import nsm
+from nsm.config import compose_config
+from nsm.data import SurfaceSampler
+from nsm.maps import NeuralMap
+from nsm.tasks import Overfit
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+import candidates  # noqa: E402
+import steps  # noqa: E402
+from training import train  # noqa: E402
+
+GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}
+MAP = {"width": 8, "depth": 1, "block": "plain", "encoding": GRID}
+SETTINGS = {
+    "optimizer": {"name": "adam", "lr": 1e-3, "encoding_lr": 1e-2},
+    "scheduler": {"name": "constant"},
+    "lambda_normal": 0.01,
+    "max_steps": 10,
+    "diagonal": 1.0,
+}
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return nsm.Surface.load("hemisphere")
+
+
+def batch_of(surface, count, dtype=torch.float64):
+    sampler = SurfaceSampler(surface)
+    samples = sampler.by_area(count, sampler.generator(0))
+    return type(samples)(*(part.to(dtype) for part in samples))
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    network = NeuralMap(**MAP, readout="linear").double()
+    torch.nn.init.normal_(network.readout.weight)
+    return network
+
+
+def test_the_squared_residuals_are_the_loss(network, surface):
+    batch = batch_of(surface, 50)
+    module = Overfit(map=network.config, **SETTINGS)
+    module.map, module.log_every = network, 2  # nothing is logged
+    loss = module.training_step(batch, 0)
+    residual = candidates.residuals(network, batch, 0.01)
+    torch.testing.assert_close(residual.square().sum(), loss)
+    found = torch.autograd.grad(residual.square().sum(), list(network.parameters()))
+    wanted = torch.autograd.grad(loss, list(network.parameters()))
+    torch.testing.assert_close(found, wanted)
+
+
+def test_products_are_those_of_the_jacobian(network, surface):
+    batch = batch_of(surface, 6)
+    parameters = list(network.parameters())
+    residual = candidates.residuals(network, batch, 0.01)
+    products = candidates.Products(residual, parameters)
+    rows = [torch.autograd.grad(entry, parameters, retain_graph=True) for entry in residual]
+    jacobian = torch.stack([torch.cat([part.flatten() for part in row]) for row in rows])
+    v, u = torch.randn(jacobian.shape[1]).double(), torch.randn(len(residual)).double()
+    torch.testing.assert_close(products.push(v), jacobian @ v)
+    torch.testing.assert_close(products.pull(u), jacobian.T @ u)
+    # J v once more, by differences
+    step = 1e-6 * v
+    moved = []
+    for sign in (1, -1):
+        for p, part in zip(parameters, step.split([p.numel() for p in parameters]), strict=True):
+            p.data += sign * part.view_as(p)
+        moved.append(candidates.residuals(network, batch, 0.01).detach())
+        for p, part in zip(parameters, step.split([p.numel() for p in parameters]), strict=True):
+            p.data -= sign * part.view_as(p)
+    torch.testing.assert_close((moved[0] - moved[1]) / 2e-6, products.push(v), rtol=1e-5, atol=1e-6)
+
+
+def test_a_damped_step_solves_its_system():
+    generator = torch.Generator().manual_seed(0)
+    design = torch.randn(30, 5, generator=generator).double()
+    wanted = torch.randn(30, generator=generator).double()
+    p = torch.zeros(5, dtype=torch.float64, requires_grad=True)
+    optimizer = candidates.LevenbergMarquardt(
+        [p], lambda: design @ p - wanted, lr=1.0, iterations=5, damping=0.5, probes=3
+    )
+
+    def closure():
+        return (design @ p - wanted).square().sum()
+
+    before = float(closure().detach())
+    optimizer.step(closure)
+    diagonal = optimizer.squares / 3
+    diagonal = diagonal + 1e-6 * diagonal.mean()
+    system = design.T @ design + 0.5 * torch.diag(diagonal)
+    torch.testing.assert_close(p.detach(), torch.linalg.solve(system, design.T @ wanted))
+    # a linear residual: what is promised comes, and the damping stays at its least
+    assert float(closure().detach()) < before and optimizer.damping == 0.5
+
+
+def test_weights_give_the_mean_by_area_back(surface):
+    sampler = candidates.ErrorSampler(surface)
+    centres = surface.vertices[surface.faces].mean(axis=1)
+    sampler.error = torch.as_tensor(np.exp(3 * centres[:, 2]))
+    drawn = sampler.weighted(200_000, sampler.generator(3))
+    height = drawn.points[:, 2]
+    area = sampler.area.numpy()
+    wanted = float(area @ centres[:, 2])
+    spread = float((height * drawn.weight).std()) / 200_000**0.5
+    assert abs(float((height * drawn.weight).mean()) - wanted) < 4 * spread
+    assert float(height.mean()) > wanted + 10 * spread
+
+
+def test_errors_draw_samples_to_their_triangles(surface):
+    sampler = candidates.ErrorSampler(surface)
+    face, weight = torch.tensor([7, 8]), torch.ones(2)
+    for _ in range(20):
+        sampler.seen(face, torch.tensor([3.0, 1.0]), weight)
+    torch.testing.assert_close(
+        sampler.error[:9], torch.tensor([1.0] * 7 + [1.5, 0.5]).double(), rtol=1e-2, atol=0
+    )
+
+
+@pytest.mark.parametrize("log2_rows", [6, 12])
+def test_a_hash_grids_jacobian_is_its_derivative(log2_rows):
+    torch.manual_seed(0)
+    grid = candidates.HashGrid(2, levels=3, coarsest=4, finest=16, log2_rows=log2_rows).double()
+    torch.nn.init.normal_(grid.tables[0])
+    x = torch.rand(200, 2).double() * 1.8 - 0.9
+    stack = grid.value_and_jacobian_stack(x)
+    for axis in range(2):
+        step = 1e-7 * torch.eye(2).double()[axis]
+        moved = (grid(x + step) - grid(x - step)) / 2e-7
+        torch.testing.assert_close(stack[1 + axis], moved, rtol=1e-5, atol=1e-5)
+    assert max(grid.rows) == min(2**log2_rows, 17**2)
+
+
+def test_levels_are_released_in_turn():
+    module = candidates.CoarseToFine(map=MAP, **SETTINGS)
+    module.progress = lambda: 0.0
+    module.on_fit_start()
+    coarse, fine = module.map.encoding.tables
+    assert coarse.any() and not fine.any()
+    for spent, released in ((0.0, False), (0.39, False), (0.41, True)):
+        module.progress = partial(float, spent)
+        module.on_train_batch_start(None, 0)
+        assert coarse.requires_grad and fine.requires_grad == released
+
+
+@pytest.mark.parametrize("kind", ["soap", "shampoo"])
+def test_only_matrices_are_preconditioned(kind):
+    pytest.importorskip("pytorch_optimizer")
+    torch.manual_seed(0)
+    settings = {**SETTINGS, "optimizer": {"name": "muon", "lr": 1e-2, "encoding_lr": 1e-2}}
+    module = candidates.Preconditioned(map=MAP, kind=kind, every=2, **settings)
+    optimizer = module.optimizer()
+    names = {id(p): name for name, p in module.map.named_parameters()}
+    matrices, *others = ([names[id(p)] for p in g["params"]] for g in optimizer.param_groups)
+    assert matrices == ["input.weight", "blocks.0.linear.weight"]
+    assert sorted(matrices + sum(others, [])) == sorted(names.values())
+    x = torch.rand(64, 2)
+
+    def loss():
+        return (module.map(x) - torch.cat([x, x[:, :1] ** 2], 1)).square().mean()
+
+    before = float(loss().detach())
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss().backward()
+        optimizer.step()
+    assert float(loss().detach()) < 0.1 * before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["candidate=gauss_newton", "optimizer.lr=1", "candidate.iterations=2"],
+        ["optimizer=muon", "candidate=preconditioned", "candidate.kind=soap"],
+        ["candidate=by_error"],
+        ["candidate=growing_batch", "candidate.first=64", "candidate.last=256"],
+        ["candidate=coarse_to_fine"],
+        ["encoding=hash_grid"],
+    ],
+    ids=lambda words: words[-1],
+)
+def test_a_candidate_trains(words, surface):
+    if "candidate.kind=soap" in words:
+        pytest.importorskip("pytorch_optimizer")
+    settings, own = candidates.parted(steps.in_full(words))
+    small = [] if "encoding=hash_grid" in words else ["encoding.resolutions=[4,16]"]
+    config = compose_config([*settings, *small, "data.batch_size=64", "trainer.max_steps=8"])
+    sizes, losses = [], []
+
+    class Watch(Callback):
+        def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            sizes.append(len(batch.uv))
+            losses.append(float(outputs["loss"]))
+
+    def piece(module):
+        return candidates.exchanged(module, own, lambda: min(1.0, len(sizes) / 6))
+
+    trainer, module, _ = train(config, surface, [Watch()], exchanged=piece)
+    assert trainer.global_step == 8 and losses[-1] < losses[0]
+    assert isinstance(module, candidates.Candidate) == bool(own)
+    if "candidate=growing_batch" in words:
+        assert sizes[0] == 64 and sizes[-1] == 256 and sizes == sorted(sizes)
+    else:
+        assert set(sizes) == {64}
