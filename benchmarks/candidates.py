@@ -481,7 +481,10 @@ class HashGrid(nn.Module):
         return self.value_and_jacobian_stack(x)[0]
 
 
-nsm.register_encoding("hash_grid", HashGrid)
+def register() -> None:
+    """Make the encoding known to settings."""
+    nsm.register_encoding("hash_grid", HashGrid)
+
 
 CANDIDATES: dict[str, type[Candidate]] = {
     "gauss_newton": GaussNewton,

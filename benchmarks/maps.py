@@ -32,7 +32,9 @@ VARIANTS = {
     "no term on triangles": ["constraints.lambda_triangles=0"],
     "no term on the seam": ["constraints.lambda_seam=0"],
     "boundary by a penalty": ["constraints.boundary=penalty"],
-    "fitted surfaces": ['phi.overrides=["experiment=fitted","trainer.max_steps=500"]'],
+    "surfaces from a random start": [
+        'phi.overrides=["start=random","encoding.resolutions=[16,64,256]"]'
+    ],
     "paper, as many steps": ["experiment=paper_pair", "trainer.max_steps=1500"],
 }
 SEAMS = {

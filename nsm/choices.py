@@ -50,7 +50,7 @@ Parameters = dict[str, Parameter]
 
 # what every optimiser, and every schedule, takes beside its own parameters
 _ALL_OPTIMIZERS: Parameters = {"encoding_lr": Parameter(float | None)}
-_ALL_SCHEDULERS: Parameters = {"warmup": Parameter(int)}
+_ALL_SCHEDULERS: Parameters = {"warmup": Parameter(int), "peak": Parameter(float)}
 
 
 def check_choices(config: DictConfig) -> None:
@@ -71,7 +71,7 @@ def check_choices(config: DictConfig) -> None:
     for group, known in named().items():
         _check_named(group, settings[group], known)
     if settings["map"]["readout"] == "fitted" and task != "overfit":
-        raise NsmError(f"setting map.readout: task={task} has no surface to fit; take linear")
+        raise NsmError(f"setting map.readout: task={task} has no surface to fit; take start=random")
     choice = TASK_CHOICES[task]
     if choice.constraints:
         held = settings["constraints"] or {}

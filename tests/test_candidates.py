@@ -13,6 +13,7 @@ import nsm
 from nsm.config import compose_config
 from nsm.data import SurfaceSampler
 from nsm.maps import NeuralMap
+from nsm.maps.encodings import ENCODINGS
 from nsm.tasks import Overfit
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
@@ -191,9 +192,13 @@ def test_only_matrices_are_preconditioned(kind):
     ],
     ids=lambda words: words[-1],
 )
-def test_a_candidate_trains(words, surface):
+def test_a_candidate_trains(words, surface, request):
     if "candidate.kind=soap" in words:
         pytest.importorskip("pytorch_optimizer")
+    if "encoding=hash_grid" in words:
+        candidates.register()
+        # other tests look at what there is to choose
+        request.addfinalizer(lambda: ENCODINGS.pop("hash_grid"))
     settings, own = candidates.parted(steps.in_full(words))
     small = [] if "encoding=hash_grid" in words else ["encoding.resolutions=[4,16]"]
     config = compose_config([*settings, *small, "data.batch_size=64", "trainer.max_steps=8"])

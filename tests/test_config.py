@@ -72,6 +72,28 @@ def test_groups_can_be_changed_apart():
     assert (config.constraints.boundary, config.constraints.lambda_seam) == ("penalty", 1e3)
 
 
+@pytest.mark.parametrize(
+    ("words", "readout", "steps"),
+    [
+        ([], "fitted", 1000),
+        (["map=residual"], "fitted", 1000),
+        (["start=random"], "none", 8000),
+        (["encoding=fourier"], "none", 8000),
+        (["encoding=identity"], "none", 8000),
+        (["encoding=fourier", "start=fitted"], "fitted", 1000),
+        (["experiment=paper"], "none", 50_000),
+        (["sweep=activation"], "none", 8000),
+        (["task=param"], "none", 2000),
+        (["task=pair_map", "encoding=fourier"], "none", 1500),
+    ],
+)
+def test_only_what_can_be_fitted_starts_so(words, readout, steps):
+    """What has no grid to fit, or no surface, starts at random, at full rates."""
+    config = compose_config(words)
+    assert (config.map.readout, config.trainer.max_steps) == (readout, steps)
+    assert config.scheduler.get("peak", 1.0) == (0.003 if readout == "fitted" else 1.0)
+
+
 def test_the_surface_group_is_the_catalogue():
     files = {name for group, name in FILES if group == "surface"} - {"base"}
     assert files == set(catalogue_names())

@@ -39,6 +39,7 @@ def test_it_reads_what_yaml_reads():
     trainer = next(group for group in groups() if group.name == "trainer").options[0]
     config = compose_config().trainer
     assert {s.key for s in trainer.settings} == {f"trainer.{key}" for key in config}
+    config = compose_config(["start=random"]).trainer
     for setting in trainer.settings:
         assert yaml.safe_load(setting.value) == config[setting.key.split(".")[1]]
 
@@ -54,7 +55,7 @@ def test_help_names_every_option(here):
 
 def test_help_on_a_group_tells_its_settings(here):
     result = here("--help", "encoding")
-    assert "encoding.resolutions=[16, 64, 256]" in result.stdout
+    assert "encoding.resolutions=[8, 32, 128]" in result.stdout
     assert "cells a side" in result.stdout
     assert "trainer" not in result.stdout
     assert "'encoding'" in here("--help", "encodin").stderr

@@ -171,20 +171,25 @@ def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: i
 
     ``constant``; ``cosine``: one half-wave down to ``final`` of the rate at ``max_steps``;
     ``sgdr``: warm restarts every ``period`` steps, each ``period_factor`` times the one before
-    (Loshchilov and Hutter, ICLR 2017). All rise linearly over the first ``warmup`` steps.
+    (Loshchilov and Hutter, ICLR 2017). All rise linearly over the first ``warmup`` steps, and are
+    ``peak`` (1 where it is not given) times the optimiser's rates.
 
     Raises:
         ValueError: the schedule is not known or does not take a parameter.
     """
     rest = dict(settings)
-    name, warmup = rest.pop("name"), rest.pop("warmup", 0)
+    name, warmup, peak = rest.pop("name"), rest.pop("warmup", 0), rest.pop("peak", 1.0)
     if name not in SCHEDULERS:
         raise ValueError(f"scheduler {name!r} is not one of {', '.join(SCHEDULERS)}")
     try:
         factor = SCHEDULERS[name](max_steps, **rest)
     except TypeError as error:
         raise ValueError(f"scheduler {name!r}: {error}") from error
-    return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / (warmup + 1)) * factor(step))
+
+    def share(step: int) -> float:
+        return peak * min(1.0, (step + 1) / (warmup + 1)) * factor(step)
+
+    return LambdaLR(optimizer, share)
 
 
 def configure(module: nn.Module, settings: Mapping[str, Any]) -> dict[str, Any]:

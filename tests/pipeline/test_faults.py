@@ -86,7 +86,8 @@ def test_a_step_that_is_not_finite_is_taken_back(surface, tmp_path, monkeypatch,
     assert all(torch.isfinite(v).all() for v in weights(tmp_path).values())
     assert neural.metrics["rms_percent"] < 20
     rates = torch.load(tmp_path / "last.ckpt", weights_only=True)["optimizer_states"][0]
-    usual = compose_config(["task=overfit", *WORDS]).optimizer.lr
+    config = compose_config(["task=overfit", *WORDS])
+    usual = config.scheduler.peak * config.optimizer.lr
     assert rates["param_groups"][0]["lr"] == pytest.approx(usual / 2)
 
 

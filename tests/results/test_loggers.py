@@ -18,7 +18,13 @@ from nsm.errors import NsmError
 from nsm.pipeline import run_overfit
 
 QUICK = ["experiment=quick", "data.held_out=512", "logger.every=5", "trainer.progress=false"]
-TINY = [*QUICK, "data.batch_size=64", "data.steps_per_epoch=10", "trainer.max_steps=20"]
+TINY = [
+    *QUICK,
+    "start=random",
+    "data.batch_size=64",
+    "data.steps_per_epoch=10",
+    "trainer.max_steps=20",
+]
 
 
 def overfitted(folder: Path, *words: str):

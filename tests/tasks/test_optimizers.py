@@ -42,6 +42,11 @@ def test_warmup_rises_linearly():
     assert lr == pytest.approx([0.2, 0.4, 0.6, 0.8, 1, 1, 1, 1])
 
 
+def test_the_peak_is_a_share_of_the_rate():
+    full, low = (rates({"name": "cosine", "warmup": 4, **p}, 50, 20) for p in ({}, {"peak": 0.01}))
+    assert low == pytest.approx([0.01 * rate for rate in full])
+
+
 def test_feature_grids_take_their_own_rate():
     network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
     optimizer = build_optimizer(network, {"name": "adam", "lr": 1e-3, "encoding_lr": 1e-2})
