@@ -21,8 +21,7 @@ import nsm
 from nsm.data import OverfitData, Samples, SurfaceSampler
 from nsm.energies.overfit import NORMAL_FLOOR, normal, position
 from nsm.maps import NeuralMap, SplineGrid
-from nsm.maps.encodings import pushed_forward, value_and_jacobian_stack
-from nsm.maps.networks import read_out
+from nsm.maps.encodings import value_and_jacobian_stack
 from nsm.surfaces import Surface
 from nsm.tasks import Overfit
 from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer, build_scheduler
@@ -92,22 +91,26 @@ def residuals(network: NeuralMap, batch: Samples, lambda_normal: float) -> Tenso
         batch: N samples.
         lambda_normal: λ_n.
     """
+    # what is added to the values alone; slices would be filled up with zeros on the way back
+    first = torch.tensor([1.0, 0.0, 0.0]).to(batch.uv)[:, None, None]
+
+    def linear(layer: nn.Linear, x: Tensor) -> Tensor:
+        return x @ layer.weight.T + first * layer.bias
+
     stack = features = _features(network.encoding, batch.uv)
+    act = network.activation
     for layer in network.layers[:-1]:
-        z = stack @ layer.weight.T
-        z = torch.cat([z[:1] + layer.bias, z[1:]])
-        stack = pushed_forward(network.activation, z)
-    stack = read_out(stack[..., :0].new_zeros(3, len(batch.uv), 3), stack, *_of(network.output))
+        value, by_u, by_v = linear(layer, stack).unbind()
+        value, slope = act.formulas.value_and_slope(value, **act.parameters_)
+        stack = torch.stack([value, by_u * slope, by_v * slope])
+    stack = linear(network.output, stack)
     if network.readout is not None:
-        stack = read_out(stack, features, *_of(network.readout))
-    cross = torch.linalg.cross(stack[1], stack[2])
+        stack = stack + linear(network.readout, features)
+    value, by_u, by_v = stack.unbind()
+    cross = torch.linalg.cross(by_u, by_v)
     turned = cross / (cross.square().sum(dim=1, keepdim=True) + NORMAL_FLOOR).sqrt()
-    parts = [stack[0] - batch.points, math.sqrt(lambda_normal) * (turned - batch.normals)]
+    parts = [value - batch.points, math.sqrt(lambda_normal) * (turned - batch.normals)]
     return torch.cat([part.flatten() for part in parts]) / math.sqrt(len(batch.uv))
-
-
-def _of(layer: nn.Linear) -> tuple[Tensor, Tensor]:
-    return layer.weight, layer.bias
 
 
 class Products:
@@ -138,11 +141,13 @@ class Products:
 
 
 class LevenbergMarquardt(Optimizer):
-    """(JᵀJ + μ D) x = −Jᵀ r by conjugate gradients, D the diagonal of JᵀJ; a step is rate · x.
+    """(JᵀJ + μ D) x = −Jᵀ r by conjugate gradients; a step is rate · x.
 
-    D is estimated by E[(Jᵀu)²], u of random signs, over all steps so far. μ follows the ratio of
-    the decrease that came to the one that the linear model promised, on the step's own batch; a
-    step that makes the loss larger there is taken back.
+    D has for each tensor of parameters the mean of the diagonal of JᵀJ there, so that entries of
+    which the batch says little stay where they are. The diagonal, which the gradients are
+    preconditioned with, is estimated by E[(Jᵀu)²], u of random signs. μ follows the ratio of the
+    decrease that came to the one that the linear model promised, both on the step's batch; a step
+    that makes the loss larger there is taken back.
 
     Args:
         parameters: as torch takes them.
@@ -165,8 +170,6 @@ class LevenbergMarquardt(Optimizer):
         super().__init__(parameters, {"lr": lr})
         self.residual, self.iterations, self.probes = residual, iterations, probes
         self.damping = self.least = damping
-        self.squares: Tensor | float = 0.0
-        self.probed = 0
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
         assert closure is not None
@@ -175,15 +178,14 @@ class LevenbergMarquardt(Optimizer):
             (group,) = self.param_groups
             products = Products(self.residual(), group["params"])
         residual = products.residual.detach()
+        diagonal = torch.zeros(())
         for _ in range(self.probes):
             sign = torch.randint(0, 2, residual.shape).to(residual).mul_(2).sub_(1)
-            self.squares = self.squares + products.pull(sign).square()
-        self.probed += self.probes
-        diagonal = self.squares / self.probed
-        # what no sample has seen so far stays where it is
-        diagonal = diagonal + 1e-6 * diagonal.mean()
-        right = -products.pull(residual)
-        x, promised = self._solved(products, diagonal, right)
+            diagonal = diagonal + products.pull(sign).square() / self.probes
+        sizes = [p.numel() for p in group["params"]]
+        means = [part.mean().expand(len(part)) for part in diagonal.split(sizes)]
+        held = self.damping * torch.cat(means)
+        x, promised = self._solved(products, -products.pull(residual), diagonal, held)
         before = float(residual.square().sum())
         with torch.no_grad():
             start = [p.clone() for p in group["params"]]
@@ -199,9 +201,11 @@ class LevenbergMarquardt(Optimizer):
             self.damping = max(self.damping / 3, self.least)
         return value
 
-    def _solved(self, products: Products, diagonal: Tensor, right: Tensor) -> tuple[Tensor, float]:
-        """x, and by how much the linear model of the loss is less there."""
-        held = self.damping * diagonal
+    def _solved(
+        self, products: Products, right: Tensor, diagonal: Tensor, held: Tensor
+    ) -> tuple[Tensor, float]:
+        """x with (JᵀJ + held) x = right, and by how much the linear model of the loss is less
+        there."""
         scale = 1 / (diagonal + held)
         x, left = torch.zeros_like(right), right.clone()
         guess = scale * left
@@ -221,7 +225,7 @@ class GaussNewton(Candidate):
     """Steps of :class:`LevenbergMarquardt` on the loss of Eq. 1, by all parameters."""
 
     def __init__(
-        self, iterations: int = 10, damping: float = 1e-3, probes: int = 2, **task: Any
+        self, iterations: int = 10, damping: float = 0.1, probes: int = 3, **task: Any
     ) -> None:
         super().__init__(**task)
         self.inner = {"iterations": iterations, "damping": damping, "probes": probes}

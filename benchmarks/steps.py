@@ -85,11 +85,10 @@ BASE: dict[str, list[str]] = {
 
 # the start by least squares, and small rates from there
 START = ["map.readout=fitted", "encoding.resolutions=[32,128,512]"]
-FITTED = [*START, "scheduler.peak=0.003"]
+FITTED = [*START, "+scheduler.peak=0.003"]
 
+LBFGS = ["optimizer=lbfgs", "scheduler.warmup=0"]
 GAUSS_NEWTON = ["candidate=gauss_newton", "optimizer.lr=1", "scheduler.warmup=0"]
-
-HELD = ["candidate.damping=0.1"]
 SOAP = ["optimizer=muon", "candidate=preconditioned", "candidate.kind=soap"]
 SHAMPOO = [*SOAP[:-1], "candidate.kind=shampoo"]
 
@@ -120,6 +119,11 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "grid 16, 64, 256, 512": ["encoding.resolutions=[16,64,256,512]"],
         "grid 32, 128, 512": ["encoding.resolutions=[32,128,512]"],
         "grid 16, 32, 64, 128, 256": ["encoding.resolutions=[16,32,64,128,256]"],
+        "grid of 2 features": ["encoding.features=2"],
+        "grid of 8 features": ["encoding.features=8"],
+        "grid of degree 3": ["encoding.degree=3"],
+    },
+    "other grids": {
         "coarse to fine": ["candidate=coarse_to_fine"],
         "coarse to fine, 16, 32, 64, 128, 256": [
             "encoding.resolutions=[16,32,64,128,256]",
@@ -127,9 +131,6 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         ],
         "hash grid, 8 levels to 256": ["encoding=hash_grid", "encoding.finest=256"],
         "hash grid, 8 levels to 512": ["encoding=hash_grid"],
-        "grid of 2 features": ["encoding.features=2"],
-        "grid of 8 features": ["encoding.features=8"],
-        "grid of degree 3": ["encoding.degree=3"],
     },
     "least squares": {
         "read-out of features": ["map.readout=linear"],
@@ -149,27 +150,19 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "fitted, Fourier, 64": ["map.readout=fitted", "encoding=fourier"],
     },
     "second order": {
-        "Gauss–Newton": [*GAUSS_NEWTON, "data.batch_size=16384"],
-        "Gauss–Newton, μ ≥ 0.1": [*GAUSS_NEWTON, *HELD, "data.batch_size=16384"],
-        "Gauss–Newton, μ ≥ 0.1, batch 65,536": [*GAUSS_NEWTON, *HELD, "data.batch_size=65536"],
-        "fitted, Gauss–Newton": [*START, *GAUSS_NEWTON, "data.batch_size=16384"],
-        "fitted, Gauss–Newton, μ ≥ 0.1": [
-            *START,
-            *GAUSS_NEWTON,
-            *HELD,
-            "data.batch_size=16384",
-        ],
-        "fitted, Gauss–Newton, μ ≥ 0.1, batch 65,536": [
-            *START,
-            *GAUSS_NEWTON,
-            *HELD,
-            "data.batch_size=65536",
-        ],
+        "Gauss–Newton": GAUSS_NEWTON,
+        "Gauss–Newton, batch 4,096": [*GAUSS_NEWTON, "data.batch_size=4096"],
+        "Gauss–Newton, batch 16,384": [*GAUSS_NEWTON, "data.batch_size=16384"],
     },
+    # all of grid 32, 128, 512
     "from the fitted start": {
         "fitted, Muon": [*FITTED, "optimizer=muon"],
-        "fitted, L-BFGS, batch 16,384": [*START, "optimizer=lbfgs", "data.batch_size=16384"],
-        "fitted, L-BFGS, batch 65,536": [*START, "optimizer=lbfgs", "data.batch_size=65536"],
+        "fitted, SOAP": [*FITTED, *SOAP],
+        "fitted, by error": [*FITTED, "candidate=by_error"],
+        "fitted, batch 256 to 8,192": [*FITTED, "candidate=growing_batch"],
+        "fitted, L-BFGS, batch 16,384": [*START, *LBFGS, "data.batch_size=16384"],
+        "fitted, Gauss–Newton": [*START, *GAUSS_NEWTON],
+        "fitted, Gauss–Newton, batch 16,384": [*START, *GAUSS_NEWTON, "data.batch_size=16384"],
     },
     "network": {
         "32 × 1": ["map.width=32"],
@@ -185,11 +178,13 @@ TRIALS: dict[str, dict[str, list[str]]] = {
     },
     "samples": {
         "no vertices": ["sampler=fresh"],
+        "no vertices, new layout": ["sampler=fresh"],
         "half vertices": ["data.vertex_share=0.5"],
         "half uniform in Ω": ["data.domain_share=0.5"],
         "a fifth uniform in Ω": ["data.domain_share=0.2"],
         "pool of 500,000": ["sampler=pool"],
         "by error": ["candidate=by_error"],
+        "by error, seed 1": ["candidate=by_error", "seed=1"],
         "by error, not weighted": ["candidate=by_error", "candidate.weighted=false"],
         "batch 256 to 8,192": ["candidate=growing_batch"],
         "batch 256": ["data.batch_size=256"],
@@ -213,7 +208,9 @@ TRIALS: dict[str, dict[str, list[str]]] = {
             "optimizer.encoding_lr=1e-2",
         ],
         "SOAP": SOAP,
+        "SOAP, seed 1": [*SOAP, "seed=1"],
         "Shampoo": SHAMPOO,
+        "L-BFGS, batch 4,096": [*LBFGS, "data.batch_size=4096"],
         "L-BFGS, batch 16,384": ["optimizer=lbfgs", "data.batch_size=16384"],
     },
     "schedule": {
@@ -281,7 +278,7 @@ def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
 def slug(trial_name: str) -> str:
     """A trial's name as a file's."""
     plain = trial_name.replace("×", "x").replace("σ", "sigma").replace("λ", "lambda")
-    plain = plain.replace("β₂", "beta2").replace("Ω", "domain").replace("μ ≥", "mu")
+    plain = plain.replace("β₂", "beta2").replace("Ω", "domain")
     plain = re.sub(r"(?<=\d\d),(?=\d{3})", "", plain)
     return re.sub(r"[^a-z0-9.=]+", "-", plain.lower()).strip("-")
 
@@ -319,6 +316,8 @@ def tables() -> str:
 
 def picture(name: str, found: dict[str, Any]) -> None:
     """The curves of one mesh, a panel for each topic, the default in each."""
+    from cycler import cycler
+    from matplotlib.colors import TABLEAU_COLORS
     from matplotlib.figure import Figure
 
     topics = {
@@ -329,8 +328,9 @@ def picture(name: str, found: dict[str, Any]) -> None:
     columns = 3
     rows = -(-len(topics) // columns)
     figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     for axis, (topic, shown) in zip(axes, topics.items(), strict=False):
+        axis.set_prop_cycle(cycler(linestyle=["-", "--"]) * cycler(color=TABLEAU_COLORS.values()))
         for key in shown if topic == "default" else ["default", *shown]:
             curve = found[key]["curve"] if key in found else []
             axis.plot(

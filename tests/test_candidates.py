@@ -89,20 +89,25 @@ def test_a_damped_step_solves_its_system():
     generator = torch.Generator().manual_seed(0)
     design = torch.randn(30, 5, generator=generator).double()
     wanted = torch.randn(30, generator=generator).double()
-    p = torch.zeros(5, dtype=torch.float64, requires_grad=True)
-    optimizer = candidates.LevenbergMarquardt(
-        [p], lambda: design @ p - wanted, lr=1.0, iterations=5, damping=0.5, probes=3
-    )
+    p, q = (torch.zeros(k, dtype=torch.float64, requires_grad=True) for k in (3, 2))
+
+    def residual():
+        return design @ torch.cat([p, q]) - wanted
 
     def closure():
-        return (design @ p - wanted).square().sum()
+        return residual().square().sum()
 
+    torch.manual_seed(0)
+    optimizer = candidates.LevenbergMarquardt(
+        [p, q], residual, lr=1.0, iterations=5, damping=0.5, probes=3000
+    )
     before = float(closure().detach())
     optimizer.step(closure)
-    diagonal = optimizer.squares / 3
-    diagonal = diagonal + 1e-6 * diagonal.mean()
-    system = design.T @ design + 0.5 * torch.diag(diagonal)
-    torch.testing.assert_close(p.detach(), torch.linalg.solve(system, design.T @ wanted))
+    squares = design.square().sum(dim=0)
+    held = torch.cat([squares[:3].mean().expand(3), squares[3:].mean().expand(2)])
+    solved = torch.linalg.solve(design.T @ design + 0.5 * torch.diag(held), design.T @ wanted)
+    # the diagonal is known to a few percent
+    torch.testing.assert_close(torch.cat([p, q]).detach(), solved, rtol=0.05, atol=0.01)
     # a linear residual: what is promised comes, and the damping stays at its least
     assert float(closure().detach()) < before and optimizer.damping == 0.5
 

@@ -10,6 +10,7 @@ from nsm.config import compose_config
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import steps  # noqa: E402
+from candidates import parted  # noqa: E402
 
 EVERY = {key: changes for trials in steps.TRIALS.values() for key, changes in trials.items()}
 OTHER_DEFAULT = [
@@ -49,3 +50,10 @@ def test_every_result_is_of_a_trial():
     assert sum(len(found) for found in steps.results().values()) == len(
         list(steps.RESULTS.glob("*/*.json"))
     )
+
+
+@pytest.mark.parametrize("key", list(steps.TRIALS["from the fitted start"]))
+def test_trials_from_the_fitted_start_have_its_grid(key):
+    config = compose_config(parted(steps.in_full(EVERY[key]))[0])
+    assert config.map.readout == "fitted"
+    assert list(config.encoding.resolutions) == [32, 128, 512]
