@@ -1,10 +1,10 @@
 """Error against time when a network is overfitted to a surface: default beside paper settings.
 
 Time is CPU time of a process that trains on one thread, so that figures from a busy machine can
-be compared. The default is trained once for each budget, with a schedule of that length; the
-published schedule knows no end, so that one run is looked at in passing. Errors are those of
-METHOD's "How quality is measured", on points that no training sees. Runs that are already in the
-result file are not repeated.
+be compared. The default is trained once for each budget, its start by least squares included, with
+a schedule of the length that the rest has room for; the published schedule knows no end, so that
+one run is looked at in passing. Errors are those of METHOD's "How quality is measured", on points
+that no training sees. Runs that are already in the result file are not repeated.
 
     python benchmarks/overfit.py --meshes FOLDER
 """
@@ -32,9 +32,12 @@ CALIBRATION_STEPS = 200
 
 
 def _default(surface: Surface, minutes: float) -> dict[str, Any]:
-    short = compose_config([f"trainer.max_steps={CALIBRATION_STEPS}"])
-    rate = train(short, surface, [])[2] / CALIBRATION_STEPS
-    steps = max(CALIBRATION_STEPS, int(60 * minutes / rate))
+    start, short = (
+        train(compose_config([f"trainer.max_steps={steps}"]), surface, [])[2]
+        for steps in (1, CALIBRATION_STEPS)
+    )
+    rate = (short - start) / (CALIBRATION_STEPS - 1)
+    steps = max(CALIBRATION_STEPS, int((60 * minutes - start) / rate))
     config = compose_config([f"trainer.max_steps={steps}"])
     _, module, seconds = train(config, surface, [])
     metrics = overfit_metrics(surface, module.map.eval())
@@ -106,7 +109,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--meshes", type=Path, help="folder with the mesh files; else fetched")
     parser.add_argument("--names", nargs="+", default=list(MESHES), choices=list(MESHES))
-    parser.add_argument("--minutes", nargs="+", type=float, default=[1, 5, 15])
+    parser.add_argument("--minutes", nargs="+", type=float, default=[0.5, 1, 5])
+    parser.add_argument("--paper-minutes", nargs="+", type=float, default=[1, 5, 15])
     parser.add_argument("--settings", nargs="+", default=["default", "paper"])
     parser.add_argument("--output", type=Path, default=RESULT)
     arguments = parser.parse_args()
@@ -126,9 +130,9 @@ def main() -> None:
                     console.print(key)
     if "paper" in arguments.settings:
         for name in arguments.names:
-            if any(f"{name}/paper/{m:g}" not in done for m in arguments.minutes):
+            if any(f"{name}/paper/{m:g}" not in done for m in arguments.paper_minutes):
                 for m, run in _paper(
-                    surface_of(name, arguments.meshes), sorted(arguments.minutes)
+                    surface_of(name, arguments.meshes), sorted(arguments.paper_minutes)
                 ).items():
                     _store(f"{name}/paper/{m:g}", run, arguments.output)
                 console.print(f"{name}/paper")
