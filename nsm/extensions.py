@@ -90,7 +90,9 @@ def register_encoding(name: str, kind: Callable[..., Encoding]) -> None:
     given = list(inspect.signature(kind).parameters.values())[1:]
     settings = {p.name: p.default for p in given if p.default is not inspect.Parameter.empty}
     _add("encoding", name, ENCODINGS, kind)
-    _offer("encoding", name, {"name": name, **settings})
+    # as for those of conf/: what has no grid to fit is trained from a random start
+    start = {"override /start@_global_.start": "random"}
+    _offer("encoding", name, {"defaults": [start, "_self_"], "name": name, **settings})
 
 
 def register_block(name: str, kind: Callable[[int, Activation], nn.Module]) -> None:

@@ -62,6 +62,11 @@ def test_jacobians_and_their_gradients(page, part):
     assert torch.autograd.gradcheck(lambda x, *_: net.value_and_jacobian(x), (x, *net.parameters()))
 
 
+def test_an_encoding_of_ones_own_starts_at_random(page):
+    assert compose_config(["encoding=waves"]).map.readout == "none"
+    assert compose_config(["encoding=waves", "start=fitted"]).map.readout == "fitted"
+
+
 def test_analytic_jacobian(page):
     dune = build_analytic({"name": "dune", "height": 0.4})
     x = torch.rand(6, 2, dtype=torch.float64)

@@ -98,7 +98,10 @@ def _fit_tables(
 ) -> None:
     size = readout.out_features
     if grid.features < size:
-        raise ValueError(f"a grid that is fitted needs {size} features or more a level")
+        raise ValueError(
+            f"a grid that is fitted needs {size} features or more a level; with fewer, take "
+            "start=random"
+        )
     nn.init.zeros_(readout.weight)
     nn.init.zeros_(readout.bias)
     left = target.clone()
