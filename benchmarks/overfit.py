@@ -2,8 +2,8 @@
 
 Time is CPU time of a process that trains on one thread, so that figures from a busy machine can
 be compared. The default is trained once for each budget, its start by least squares included, with
-a schedule of the length that the rest has room for; the published schedule knows no end, so that
-one run is looked at in passing. Errors are those of METHOD's "How quality is measured", on points
+a schedule that ends with the budget; the published schedule knows no end, so that one run is looked
+at in passing. Errors are those of METHOD's "How quality is measured", on points
 that no training sees. Runs that are already in the result file are not repeated.
 
     python benchmarks/overfit.py --meshes FOLDER
@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from training import MESHES, Clock, surface_of, train
+from training import MESHES, Clock, OnTheClock, surface_of, train
 
 from nsm.config import compose_config
 from nsm.pipeline import quiet_lightning
@@ -28,20 +28,17 @@ from nsm.results.callbacks import GradientWatch
 from nsm.surfaces import Surface
 
 RESULT = Path(__file__).parent / "results" / "overfit.json"
-CALIBRATION_STEPS = 200
 
 
 def _default(surface: Surface, minutes: float) -> dict[str, Any]:
-    start, short = (
-        train(compose_config([f"trainer.max_steps={steps}"]), surface, [])[2]
-        for steps in (1, CALIBRATION_STEPS)
-    )
-    rate = (short - start) / (CALIBRATION_STEPS - 1)
-    steps = max(CALIBRATION_STEPS, int((60 * minutes - start) / rate))
-    config = compose_config([f"trainer.max_steps={steps}"])
-    _, module, seconds = train(config, surface, [])
-    metrics = overfit_metrics(surface, module.map.eval())
-    return {"steps": steps, "cpu_seconds": seconds, "metrics": metrics}
+    found: dict[str, Any] = {}
+
+    def at_mark(module: Any, seconds: float, step: int) -> None:
+        found.update(steps=step, cpu_seconds=seconds)
+        found["metrics"] = overfit_metrics(surface, module.map.eval())
+
+    train(compose_config(), surface, [OnTheClock([60 * minutes], at_mark)], max_steps=-1)
+    return found
 
 
 def _paper(surface: Surface, minutes: list[float]) -> dict[float, dict[str, Any]]:

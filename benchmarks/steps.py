@@ -22,11 +22,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from candidates import exchanged, parted, register
 from rich.console import Console
-from training import MESHES, Clock, surface_of, train
+from training import MESHES, OnTheClock, surface_of, train
 
 from nsm.config import compose_config
 from nsm.pipeline import quiet_lightning
@@ -223,24 +222,6 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "λ_n = 0.001": ["energy.lambda_normal=0.001"],
     },
 }
-
-
-class OnTheClock(Clock):
-    """A schedule that comes to an end does so with the budget."""
-
-    @property
-    def progress(self) -> float:
-        """Share of the budget that is spent."""
-        return min(1.0, self.spent / self.budget)
-
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        def by_time(factor: Any) -> Any:
-            return lambda _: factor(STEPS * self.progress)
-
-        if pl_module.hparams["scheduler"]["name"] == "cosine":
-            for configured in trainer.lr_scheduler_configs:
-                scheduler: Any = configured.scheduler
-                scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
 
 
 def in_full(changes: list[str]) -> list[str]:

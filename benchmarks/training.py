@@ -54,6 +54,24 @@ class Clock(Callback):
         trainer.should_stop = trainer.should_stop or not self.marks
 
 
+class OnTheClock(Clock):
+    """A schedule that comes to an end does so with the budget."""
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent."""
+        return min(1.0, self.spent / self.budget)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        def by_time(factor: Any) -> Any:
+            return lambda _: factor(pl_module.hparams["max_steps"] * self.progress)
+
+        if pl_module.hparams["scheduler"]["name"] == "cosine":
+            for configured in trainer.lr_scheduler_configs:
+                scheduler: Any = configured.scheduler
+                scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
+
+
 def train(
     config: DictConfig,
     surface: Surface,
