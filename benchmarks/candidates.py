@@ -182,6 +182,8 @@ class LevenbergMarquardt(Optimizer):
         for _ in range(self.probes):
             sign = torch.randint(0, 2, residual.shape).to(residual).mul_(2).sub_(1)
             diagonal = diagonal + products.pull(sign).square() / self.probes
+        # weights before an output layer that is zero have no part in the loss yet
+        diagonal = diagonal + 1e-6 * diagonal.mean()
         sizes = [p.numel() for p in group["params"]]
         means = [part.mean().expand(len(part)) for part in diagonal.split(sizes)]
         held = self.damping * torch.cat(means)

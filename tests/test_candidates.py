@@ -189,6 +189,7 @@ def test_only_matrices_are_preconditioned(kind):
     "words",
     [
         ["candidate=gauss_newton", "optimizer.lr=1", "candidate.iterations=2"],
+        ["candidate=gauss_newton", "optimizer.lr=1", "map.readout=fitted", "candidate.damping=1"],
         ["optimizer=muon", "candidate=preconditioned", "candidate.kind=soap"],
         ["candidate=by_error"],
         ["candidate=growing_batch", "candidate.first=64", "candidate.last=256"],
@@ -219,6 +220,7 @@ def test_a_candidate_trains(words, surface, request):
 
     trainer, module, _ = train(config, surface, [Watch()], exchanged=piece)
     assert trainer.global_step == 8 and losses[-1] < losses[0]
+    assert module.map.output.weight.any()  # zero at the start where it is fitted
     assert isinstance(module, candidates.Candidate) == bool(own)
     if "candidate=growing_batch" in words:
         assert sizes[0] == 64 and sizes[-1] == 256 and sizes == sorted(sizes)
