@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,14 +36,21 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     colours = (s.vertices - low) / np.maximum(extent, 1e-12)
     carried = f._back.take(colours, s.faces)
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
+
+    def at_source(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
+        return left.draw(s.vertices, s.faces, paint, s.twins)
+
+    def at_target(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
+        return right.draw(target, t.faces, paint, t.twins)
+
     rows = [
         [
-            (left.draw(s.vertices, s.faces, checked(s.uv)), f"{s.name}: its checkerboard"),
-            (right.draw(target, t.faces, checked(f.source_uv)), f"carried to {t.name}"),
+            (at_source(checked(s.uv)), f"{s.name}: its checkerboard"),
+            (at_target(checked(f.source_uv)), f"carried to {t.name}"),
         ],
         [
-            (left.draw(s.vertices, s.faces, lambda blend: blend(colours)), "colours of position"),
-            (right.draw(target, t.faces, lambda blend: blend(carried)), f"carried to {t.name}"),
+            (at_source(lambda blend: blend(colours)), "colours of position"),
+            (at_target(lambda blend: blend(carried)), f"carried to {t.name}"),
         ],
     ]
     save_figure(panels(*rows), path)
@@ -66,8 +74,8 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     other = View(image, PANEL, frame=view.frame)
     figure = panels(
         [
-            (view.draw(s.vertices, s.faces, paint), f"{s.name}: symmetric Dirichlet"),
-            (other.draw(image, s.faces, paint), f"its image on {f.target.surface.name}"),
+            (view.draw(s.vertices, s.faces, paint, s.twins), f"{s.name}: symmetric Dirichlet"),
+            (other.draw(image, s.faces, paint, s.twins), f"its image on {f.target.surface.name}"),
             (np.ones((PANEL, PANEL, 3)), ""),
         ]
     )
@@ -94,7 +102,9 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
 
     def draw(t: float, size: int) -> np.ndarray:
         view = View(both, size, frame=frame)
-        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv))).astype(np.uint8)
+        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv), s.twins)).astype(
+            np.uint8
+        )
 
     row = np.concatenate([draw(t, _STRIP) for t in np.linspace(0, 1, 5)], axis=1)
     data = io.BytesIO()

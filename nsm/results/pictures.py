@@ -35,9 +35,11 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     error = vertex_error(surface, neural.map)
     scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
     view = View(surface.vertices, PANEL)
-    source = view.draw(surface.vertices, surface.faces, _grey)
+    source = view.draw(surface.vertices, surface.faces, _grey, surface.twins)
     colours = scale.to_rgba(error)[:, :3]
-    image = view.draw(evaluate(neural.map, surface.uv), surface.faces, lambda blend: blend(colours))
+    image = view.draw(
+        evaluate(neural.map, surface.uv), surface.faces, lambda blend: blend(colours), surface.twins
+    )
     rms = neural.metrics.get("rms_percent")
     title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
     figure = panels([(source, f"{surface.name}: mesh"), (image, title)])
@@ -93,7 +95,8 @@ def parameterization_picture(
     """
     view = View(surface.vertices, PANEL)
     above = [
-        (view.draw(surface.vertices, surface.faces, checked(uv)), name) for name, uv in maps.items()
+        (view.draw(surface.vertices, surface.faces, checked(uv), surface.twins), name)
+        for name, uv in maps.items()
     ]
     below = [(layout_image(surface, uv, size=PANEL), "") for uv in maps.values()]
     save_figure(panels(above, below), path)

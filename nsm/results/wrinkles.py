@@ -8,11 +8,10 @@ normal changes over a short way, on φ and on the source.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import nn
 
 from nsm.results.evaluation import evaluate_jacobian
+from nsm.results.render import vertex_normals
 from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 
@@ -49,7 +48,8 @@ def normal_variation(
         surface more wrinkled than its source, below 0 one that smooths the source's detail over.
     """
     start, end = _ways(surface, distance * surface.bounding_box_diagonal, samples, seed)
-    smooth = _vertex_normals(surface)
+    smooth = vertex_normals(surface.vertices, surface.faces, surface.twins)
+    smooth[~smooth.any(axis=1)] = np.nan
     there, mesh = [], []
     for places in (start, end):
         jacobian = evaluate_jacobian(phi, places.take(surface.uv, surface.faces))[1]
@@ -77,18 +77,6 @@ def _ways(surface: Surface, length: float, count: int, seed: int) -> tuple[Place
     direction = np.cos(angle) * along + np.sin(angle) * across
     points = start.take(surface.vertices, surface.faces)
     return start, locate(points + length * direction, surface.vertices, surface.faces)
-
-
-def _vertex_normals(surface: Surface) -> np.ndarray:
-    """Area-weighted normals (V, 3); a vertex that the cut doubled has one normal on both sides."""
-    corners = surface.vertices[surface.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = len(surface.vertices)
-    links = coo_matrix((np.ones(len(surface.twins)), tuple(surface.twins.T)), shape=(size, size))
-    point = connected_components(links, directed=False)[1]
-    total = np.zeros((size, 3))
-    np.add.at(total, point[surface.faces].ravel(), np.repeat(cross, 3, axis=0))
-    return _unit(total[point])
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

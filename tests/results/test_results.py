@@ -23,7 +23,7 @@ from nsm.results import (
     reconstruction_image,
     save_surface,
 )
-from nsm.results.render import View, rasterise
+from nsm.results.render import View, rasterise, vertex_normals
 from nsm.surfaces import Surface
 from nsm.surfaces.surface import as_it_lies
 
@@ -261,6 +261,20 @@ def test_a_drawn_square_fills_its_share_of_the_picture():
     covered = (picture < 0.99).all(axis=2).mean()
     # 1 / 1.06 wide, and as much lower as the slanted view makes it
     assert covered == pytest.approx(np.sin(np.radians(50)) / 1.06**2, rel=0.03)
+
+
+def test_no_crease_shows_where_a_mesh_was_cut():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    surface = Surface.from_arrays(ball.vertices, ball.faces, cache=False)
+    exact = surface.vertices / np.linalg.norm(surface.vertices, axis=1)[:, None]
+    turned = {}
+    for name, twins in (("cut", None), ("whole", surface.twins)):
+        normal = vertex_normals(surface.vertices, surface.faces, twins)
+        turned[name] = np.degrees(np.arccos(np.clip((normal * exact).sum(axis=1), -1, 1)))
+        assert np.allclose(np.linalg.norm(normal, axis=1), 1)
+    assert turned["whole"].max() < 3 < turned["cut"].max()
+    a, b = vertex_normals(surface.vertices, surface.faces, surface.twins)[surface.twins.T]
+    assert np.allclose(a, b)
 
 
 def test_pictures_are_not_blank(neural, tmp_path):

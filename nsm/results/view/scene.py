@@ -80,10 +80,7 @@ class Shape:
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
         """Unit normals (V, 3) where its vertices are at (V, 3); the seam is smooth."""
-        total = np.zeros((len(vertices), 3))
-        np.add.at(total, self._uncut, vertex_normals(vertices, self.faces))
-        total = total[self._uncut]
-        return total / np.maximum(np.linalg.norm(total, axis=1), 1e-30)[:, None]
+        return vertex_normals(vertices, self.faces, self.twins)
 
 
 class Scale(NamedTuple):
