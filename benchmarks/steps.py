@@ -155,6 +155,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
     },
     # all of grid 32, 128, 512
     "from the fitted start": {
+        "fitted, hardly trained": [*START, "+scheduler.peak=3e-6"],
         "fitted, Muon": [*FITTED, "optimizer=muon"],
         "fitted, SOAP": [*FITTED, *SOAP],
         "fitted, by error": [*FITTED, "candidate=by_error"],
