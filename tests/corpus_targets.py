@@ -18,7 +18,7 @@ from tiny import Results, results
 import nsm
 from nsm.config import read_config
 from nsm.errors import NsmError
-from nsm.pipeline.common import step_of
+from nsm.pipeline.common import stored_state
 from nsm.surfaces.landmarks import read_landmarks, read_pairs
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import clean
@@ -101,6 +101,6 @@ TARGETS: dict[str, Callable[[bytes], bool]] = {
     "config": partial(_in_file, "config.yaml", read_config),
     "pairs": partial(_in_file, "pairs.json", read_pairs),
     "landmarks": partial(_in_file, "landmarks.vts", read_landmarks),
-    "checkpoint": partial(_in_file, "last.ckpt", step_of),
+    "checkpoint": partial(_in_file, "last.ckpt", stored_state),
     **{stem: partial(_artefact, stem) for stem in ARTEFACTS},
 }

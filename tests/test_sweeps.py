@@ -82,6 +82,15 @@ def test_what_an_interruption_left_is_gone_on_with(tmp_path, here):
     assert steps["steps"] == 4
 
 
+def test_jobs_in_one_batch(tmp_path, here):
+    result = here("-m", *TINY, "hydra/launcher=together", "seed=0,1")
+    assert result.returncode == 0, result.stderr
+    assert "next, 2 in one batch: seed=0; seed=1" in result.stdout
+    assert "2 jobs" in result.stdout and "2 complete" in result.stdout
+    told = [json.loads((place / "metrics.json").read_text()) for place in jobs(tmp_path).values()]
+    assert [words["together"] for words in told] == [2, 2]
+
+
 def test_settings_of_all_jobs_are_checked_before_the_first_starts(tmp_path, here):
     result = here("-m", *TINY, "activation.beta=1,soft")
     assert result.returncode == 2

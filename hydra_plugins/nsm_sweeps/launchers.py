@@ -97,6 +97,35 @@ class Serial(SweepLauncher):
             yield job, run_job(*job.call, log=False)
 
 
+class Together(SweepLauncher):
+    """Jobs of task=overfit with networks and settings that are alike in one batch in this process,
+    the others one after the other.
+
+    Args:
+        at_once: jobs in a batch, at most.
+    """
+
+    def __init__(self, at_once: int) -> None:
+        self.at_once = at_once
+
+    def run(self, jobs: list[Job]) -> Iterator[Finished]:
+        from nsm.pipeline.jobs import run_job
+        from nsm.pipeline.together import batches, run_together
+
+        if self.at_once < 1:
+            raise NsmError("setting hydra.launcher.at_once: it is at least 1")
+        for numbers in batches([job.settings for job in jobs], self.at_once):
+            batch = [jobs[number] for number in numbers]
+            names = [" ".join(job.words) or job.folder.name for job in batch]
+            if len(batch) == 1:
+                self._say(f"next: {names[0]}")
+                yield batch[0], run_job(*batch[0].call, log=False)
+                continue
+            self._say(f"next, {len(batch)} in one batch: {'; '.join(names)}")
+            for number, error in run_together([job.call for job in batch]):
+                yield batch[number], error
+
+
 class Joblib(SweepLauncher):
     """Processes on this machine.
 

@@ -120,16 +120,25 @@ class SeveralData(pl.LightningDataModule):
     """The samples that :class:`OverfitData` has of each of k surfaces: Samples of (k, N, ...).
 
     Args:
-        surfaces: the prepared surfaces.
+        surfaces: the prepared surfaces; one may be there more than once.
+        seeds: of the training samples, one for each. What is the same is drawn once.
         **settings: as for :class:`OverfitData`, with the steps between two looks at the held-out
             points.
     """
 
     def __init__(
-        self, surfaces: Sequence[Surface], *, steps_per_epoch: int, **settings: Any
+        self,
+        surfaces: Sequence[Surface],
+        seeds: Sequence[int],
+        *,
+        steps_per_epoch: int,
+        **settings: Any,
     ) -> None:
         super().__init__()
-        self.parts = [OverfitData(surface, **settings) for surface in surfaces]
+        asked = list(zip(map(id, surfaces), seeds, strict=True))
+        known = dict(zip(asked, surfaces, strict=True))
+        self.parts = [OverfitData(known[one], seed=one[1], **settings) for one in known]
+        self.order = [list(known).index(one) for one in asked]
         self.steps_per_epoch = steps_per_epoch
 
     def setup(self, stage: str | None = None) -> None:
@@ -139,15 +148,15 @@ class SeveralData(pl.LightningDataModule):
 
     def batch(self, step: int) -> Samples:
         """The training samples of a step."""
-        return _stacked([part.batch(step) for part in self.parts])
+        return self._stacked([part.batch(step) for part in self.parts])
 
     def train_dataloader(self) -> DataLoader[Samples]:
         return Steps.following(self.trainer, self.batch, self.steps_per_epoch)
 
     def val_dataloader(self) -> DataLoader[Samples]:
         each = zip(*(part.held_out_batches() for part in self.parts), strict=True)
-        return DataLoader([_stacked(batches) for batches in each], batch_size=None)  # type: ignore[arg-type]
+        return DataLoader([self._stacked(batches) for batches in each], batch_size=None)  # type: ignore[arg-type]
 
-
-def _stacked(samples: Sequence[Samples]) -> Samples:
-    return Samples(*(torch.stack(same) for same in zip(*samples, strict=True)))
+    def _stacked(self, samples: Sequence[Samples]) -> Samples:
+        each = zip(*(samples[i] for i in self.order), strict=True)
+        return Samples(*(torch.stack(same) for same in each))

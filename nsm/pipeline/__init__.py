@@ -8,11 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from nsm.config import checked, read_config
 from nsm.errors import NsmError
 from nsm.pipeline.alone import alone
 from nsm.pipeline.collection_map import run_collection_map
-from nsm.pipeline.common import CONFIG_FILE, quiet_lightning
+from nsm.pipeline.common import quiet_lightning, stored_config
 from nsm.pipeline.overfit import build_overfit, run_overfit
 from nsm.pipeline.pair_map import run_pair_map
 from nsm.pipeline.param import run_param
@@ -54,14 +53,7 @@ def run_held(config: DictConfig, folder: Path) -> None:
     """What :func:`run` does, in a folder that its caller holds."""
     resuming = config.resume is not None
     if resuming:
-        config = _stored_config(folder)
+        config = stored_config(folder)
     if config.task.name not in TASKS:
         raise NsmError(f"task.name={config.task.name} is not one of {', '.join(TASKS)}")
     TASKS[config.task.name](config, folder, resuming=resuming)
-
-
-def _stored_config(folder: Path) -> DictConfig:
-    file = folder / CONFIG_FILE
-    if not file.is_file():
-        raise NsmError(f"resume={folder}: no {CONFIG_FILE} there; give the folder of a run")
-    return checked(read_config(file))

@@ -7,7 +7,8 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pytorch_lightning.loggers import Logger
 from rich.console import Console
 from torch.multiprocessing.spawn import ProcessRaisedException
 
-from nsm.config import PRECISIONS
+from nsm.config import PRECISIONS, checked, read_config
 from nsm.data import OverfitData
 from nsm.errors import NsmError
 from nsm.pipeline.processes import Process, shared_steps, take_over, told_by
@@ -28,11 +29,12 @@ from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
 from nsm.results.faults import Faults, faults_of
 from nsm.results.files import as_json, check_stored
-from nsm.results.loggers import build_loggers, close, log_figures
+from nsm.results.loggers import Distributed, build_loggers, close, log_figures, loggers_of
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
 from nsm.surfaces import Surface
 from nsm.tasks.compiling import Compiled
+from nsm.tasks.several import Several
 
 CONFIG_FILE = "config.yaml"
 CHECKPOINT_FILE = "last.ckpt"
@@ -76,11 +78,28 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return container  # type: ignore[return-value]
 
 
+def stored_config(folder: Path) -> DictConfig:
+    """The configuration of a run that goes on.
+
+    Raises:
+        NsmError: none is there, or it cannot be used.
+    """
+    file = folder / CONFIG_FILE
+    if not file.is_file():
+        raise NsmError(f"resume={folder}: no {CONFIG_FILE} there; give the folder of a run")
+    return checked(read_config(file))
+
+
+def settle_path(config: DictConfig) -> None:
+    """Make the path of the group ``surface``, if any, absolute: resuming works from any folder."""
+    if config.surface.path is not None:
+        config.surface.path = os.path.abspath(config.surface.path)
+
+
 def configured_surface(config: DictConfig) -> Surface:
     """The surface of the group ``surface``, prepared; NsmError if it cannot be."""
+    settle_path(config)
     settings = config.surface
-    if settings.path is not None:
-        settings.path = os.path.abspath(settings.path)  # resuming works from any folder
     return Surface.load(
         settings.path if settings.path is not None else settings.name,
         domain=config.domain,
@@ -131,6 +150,78 @@ def fitted(
     resuming: bool,
 ) -> pl.Trainer:
     """Train a module in its run folder; KeyboardInterrupt if the user stops it."""
+    return trained([Run(config, folder, resuming)], data, module, console, pictures, title)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training to be made.
+
+    Attributes:
+        config: as :func:`nsm.config.compose_config` gives it.
+        folder: the run folder.
+        resuming: go on from the folder's checkpoint, if there is one.
+    """
+
+    config: DictConfig
+    folder: Path
+    resuming: bool
+
+    @property
+    def checkpoint(self) -> Path | None:
+        """What the training goes on from; None: from its beginning, as one that was killed before
+        its first checkpoint does."""
+        file = self.folder / CHECKPOINT_FILE
+        return file if self.resuming and file.is_file() else None
+
+    @property
+    def stage(self) -> tuple[int, int] | None:
+        """How far it is, which trainings in one batch have in common: steps, and parts that batches
+        are evaluated in. None: it has to go on alone, since it is at its end, has had faults of its
+        own, or has a checkpoint that cannot be read."""
+        if self.checkpoint is None:
+            return 0, 1
+        try:
+            state = stored_state(self.checkpoint)
+            if state["callbacks"]["Faults"]["rollbacks"]:
+                return None
+            stage = state["global_step"], int(state["nsm_parts"])
+        except (NsmError, KeyError, TypeError, ValueError):
+            return None
+        return stage if stage[0] < self.config.trainer.max_steps else None
+
+    def loggers(self, first_step: int) -> list[Logger]:
+        """Those of the configuration, for a training that starts at a step."""
+        settings = plain(self.config)
+        logged = settings["logger"]
+        places = {key: logged[key] for key in ("project", "uri", "every")}
+        return build_loggers(
+            logged["kinds"], self.folder, settings, first_step=first_step, **places
+        )
+
+
+def trained(
+    runs: Sequence[Run],
+    data: pl.LightningDataModule,
+    module: Any,
+    console: Console,
+    pictures: Pictures | None,
+    title: str,
+) -> pl.Trainer:
+    """Train a module in its run folder, or that of several trainings in one batch, each in its own.
+
+    Args:
+        runs: one, or those of a :class:`nsm.tasks.several.Several`, whose checkpoints are of one
+            step; their settings are the same in what concerns the training as a whole.
+        data, module, console: the samples, what is trained, and where to print.
+        pictures: for the logs, if any.
+        title: what is trained, in words.
+
+    Raises:
+        KeyboardInterrupt: the user stops it.
+        Parted: several trainings cannot go on in one batch.
+    """
+    config, folder = runs[0].config, runs[0].folder
     settings = config.trainer
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
@@ -138,7 +229,7 @@ def fitted(
     callbacks: list[Callback] = [
         faults,
         GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window),
-        AtomicCheckpoint(folder / CHECKPOINT_FILE),
+        AtomicCheckpoint(*(run.folder / CHECKPOINT_FILE for run in runs)),
     ]
     if settings.progress:
         shown = (module.progress_figure, module.progress_form)
@@ -175,18 +266,20 @@ def fitted(
             f"setting trainer.accelerator={accelerator}, trainer.devices={settings.devices}: "
             f"{reason}"
         ) from error
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(config).encode())
-    # killed before the first checkpoint, a run starts again from its beginning
-    checkpoint = folder / CHECKPOINT_FILE if resuming else None
-    first_step = step_of(checkpoint) if checkpoint and checkpoint.is_file() else 0
-    if not first_step:
-        checkpoint = None
-    logged = plain(config)["logger"]
-    kinds, places = logged["kinds"], {key: logged[key] for key in ("project", "uri", "every")}
+    for run in runs:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(run.folder / CONFIG_FILE, OmegaConf.to_yaml(run.config).encode())
+    states = [stored_state(run.checkpoint) for run in runs if run.checkpoint]
+    first_step = states[0]["global_step"] if states else 0
+    checkpoint = runs[0].checkpoint if first_step else None
+    if isinstance(module, Several):
+        module.stored = states
+    del states
 
     def loggers(step: int) -> list[Logger]:
-        return build_loggers(kinds, folder, plain(config), first_step=step, **places)
+        if len(runs) == 1 or not config.logger.kinds:
+            return runs[0].loggers(step)
+        return [Distributed([run.loggers(step) for run in runs])]
 
     if several:
         trainer.callbacks.insert(0, Process(console, lambda: loggers(first_step)))  # type: ignore[attr-defined]
@@ -211,7 +304,8 @@ def fitted(
         if trainer.state.status != "finished":
             close(trainer.loggers, "failed")
     if trainer.interrupted:
-        console.print(f"interrupted; go on with: nsm resume={folder}", soft_wrap=True)
+        how = f"go on with: nsm resume={folder}" if len(runs) == 1 else "the same command goes on"
+        console.print(f"interrupted; {how}", soft_wrap=True)
         raise KeyboardInterrupt
     if several:
         take_over(trainer, data, folder / CHECKPOINT_FILE)
@@ -237,15 +331,16 @@ def quiet_lightning() -> None:
     warnings.filterwarnings("ignore", module="lightning_fabric")
 
 
-def step_of(checkpoint: Path) -> int:
-    """How many steps the training of a checkpoint has made.
+def stored_state(checkpoint: Path) -> dict[str, Any]:
+    """What a checkpoint holds; its ``global_step`` is a number.
 
     Raises:
         NsmError: a file that is damaged, foreign, or that would call or swell.
     """
     try:
         check_stored(checkpoint)
-        return int(torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"])
+        state: dict[str, Any] = torch.load(checkpoint, weights_only=True, map_location="cpu")
+        return {**state, "global_step": int(state["global_step"])}
     except Exception as error:  # whatever a damaged or foreign file raises
         raise _no_checkpoint(checkpoint) from error
 
@@ -261,10 +356,20 @@ def write_figures(
     trainer: pl.Trainer,
     started: float,
     figures: dict[str, Any],
+    index: int = 0,
 ) -> None:
     """Put the figures into the logs, and write metrics.json, last of all: its presence says that
-    the run is complete."""
-    log_figures(trainer.loggers, plain(config), figures["metrics"], trainer.global_step)
+    the run is complete.
+
+    Args:
+        config, folder, surface: of the run.
+        trainer: that has trained it, or several in one batch, of which it is number ``index``.
+        started: when the run began, by ``time.monotonic``.
+        figures: ``metrics``, and what else is to be in the file.
+        index: see ``trainer``.
+    """
+    loggers = loggers_of(trainer.loggers, index)
+    log_figures(loggers, plain(config), figures["metrics"], trainer.global_step)
     words = {
         "surface": surface.name,
         "steps": trainer.global_step,

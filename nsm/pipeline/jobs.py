@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from nsm.config import checked, register_resolvers
 from nsm.errors import NsmError
@@ -17,6 +17,8 @@ from nsm.pipeline import run_held
 from nsm.pipeline.alone import alone
 from nsm.pipeline.common import CONFIG_FILE
 from nsm.sweeps import is_complete
+
+Result = TypeVar("Result")
 
 ERROR_FILE, LOG_FILE = "error.txt", "log.txt"
 
@@ -38,29 +40,43 @@ def run_job(settings: dict[str, Any], folder: str, cwd: str, *, log: bool) -> st
     os.chdir(cwd)
     register_resolvers()
     place = Path(folder)
+
+    def run() -> None:
+        if not is_complete(place):  # another sweep may have been at it
+            run_held(job_config(settings, place), place)
+
     try:
         with alone(place), _output(place / LOG_FILE if log else None):
             (place / ERROR_FILE).unlink(missing_ok=True)
-            return _attempt(settings, place)
+            return attempted(place, run)[1]
     except NsmError as error:  # another process is at work on it
         return str(error)
 
 
-def _attempt(settings: dict[str, Any], place: Path) -> str | None:
+def job_config(settings: dict[str, Any], place: Path) -> DictConfig:
+    """The configuration of a job, which goes on with what is in its folder.
+
+    Raises:
+        NsmError: settings that cannot be used.
+    """
+    config = checked(OmegaConf.create(settings))
+    if (place / CONFIG_FILE).is_file():
+        config.resume = str(place)
+    return config
+
+
+def attempted(place: Path, work: Callable[[], Result]) -> tuple[Result | None, str | None]:
+    """Do a job's work in its folder: the result, and why it failed, in one line, which is written
+    there as well."""
     try:
-        if not is_complete(place):  # another sweep may have been at it
-            config = checked(OmegaConf.create(settings))
-            if (place / CONFIG_FILE).is_file():
-                config.resume = str(place)
-            run_held(config, place)
-        return None
+        return work(), None
     except NsmError as error:
         message = text = str(error)
     except Exception as error:  # a defect of nsm: the other jobs shall not suffer
         message = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         text = traceback.format_exc()
     (place / ERROR_FILE).write_text(text.rstrip() + "\n", encoding="utf-8")
-    return message
+    return None, message
 
 
 @contextmanager

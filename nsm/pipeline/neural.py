@@ -4,39 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, cast
 
-import pytorch_lightning as pl
 from filelock import FileLock
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.config import compose_config
-from nsm.data import SeveralData
 from nsm.errors import NsmError
-from nsm.maps import NeuralMap
-from nsm.pipeline.common import (
-    CHECKPOINT_FILE,
-    CONFIG_FILE,
-    built,
-    configured_surface,
-    fitted,
-    frozen,
-    plain,
-    with_map,
-    write_figures,
-)
-from nsm.pipeline.overfit import run_overfit
-from nsm.results import NeuralSurface, load_surface, overfit_metrics, save_surface
-from nsm.results.files import atomic_write
+from nsm.pipeline.common import CHECKPOINT_FILE, Run, configured_surface, plain
+from nsm.pipeline.overfit import common_settings, leave_results, overfit_together, run_overfit
+from nsm.results import NeuralSurface, load_surface
 from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
-from nsm.tasks import OverfitSeveral
-from nsm.tasks.least_squares import fit_readout
+from nsm.sweeps import is_complete
+from nsm.tasks.several import Parted
 
 # settings that do not change what a neural surface becomes
 _INCIDENTAL = (
@@ -85,7 +70,7 @@ def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralS
 def _made(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurface:
     folder = _place_of(surface, overfit)
     with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
-        if (folder / "metrics.json").exists():
+        if is_complete(folder):
             console.print(f"{surface.name}: neural surface taken from the cache")
             return load_surface(folder)
         return run_overfit(overfit, folder, surface, resuming=(folder / CHECKPOINT_FILE).exists())
@@ -107,67 +92,30 @@ def made_together(
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
     overfit = _settings_of_phi(config)
-    limits = (overfit.trainer.stop_gradient_norm, overfit.trainer.gradient_clip)
-    # these look at a whole training's gradient, where each surface needs its own
-    if in_one_batch and limits == (None, None):
+    if in_one_batch and common_settings(plain(overfit)) is not None:
         places = {_place_of(surface, overfit): surface for surface in surfaces}
-        missing = {p: s for p, s in places.items() if not (p / "metrics.json").exists()}
-        # what was begun alone goes on alone
-        if len(missing) > 1 and not any((p / CHECKPOINT_FILE).exists() for p in missing):
+        missing = {p: s for p, s in places.items() if not is_complete(p)}
+        if len(missing) > 1:
             _fill_cache(missing, overfit, console)
     return [_made(surface, overfit, console) for surface in surfaces]
 
 
 def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Console) -> None:
     started = time.monotonic()
-    names = " ".join(sorted(folder.name for folder in missing))
-    common = (
-        cache_folder() / "neural" / f"several-{hashlib.sha256(names.encode()).hexdigest()[:32]}"
-    )
-    surfaces = list(missing.values())
-    with FileLock(common.with_suffix(".lock")):
-        if all((folder / "metrics.json").exists() for folder in missing):
-            return  # another process has made them
-        module, trainer = _trained_together(overfit, common, surfaces, console)
-        for (folder, surface), network in zip(missing.items(), module.maps, strict=True):
-            phi = frozen(network)
-            neural = NeuralSurface(surface, phi, overfit_metrics(surface, phi), plain(overfit))
-            with FileLock(folder.with_suffix(".lock")):
-                save_surface(folder, neural)
-                atomic_write(folder / CONFIG_FILE, OmegaConf.to_yaml(overfit).encode())
-                figures = {"together": len(missing), "metrics": neural.metrics}
-                write_figures(overfit, folder, surface, trainer, started, figures)
-            console.print(f"{surface.name}: RMS error {neural.metrics['rms_percent']:.3f} %")
-        shutil.rmtree(common)
-
-
-def _trained_together(
-    config: DictConfig, folder: Path, surfaces: Sequence[Surface], console: Console
-) -> tuple[OverfitSeveral, pl.Trainer]:
-    def make(common: dict[str, Any]) -> OverfitSeveral:
-        module = OverfitSeveral(
-            seed=config.seed,
-            **with_map(common, out_dim=3),
-            lambda_normal=float(config.energy.lambda_normal),
-            diagonals=[surface.bounding_box_diagonal for surface in surfaces],
-        )
-        if config.map.readout == "fitted":
-            for network, surface in zip(module.maps, surfaces, strict=True):
-                fit_readout(cast(NeuralMap, network), surface, seed=config.seed)
-        return module
-
-    module = built(config, make)
-    trainer = fitted(
-        config,
-        folder,
-        SeveralData(surfaces, **plain(config)["data"], seed=config.seed),
-        module,
-        console,
-        None,
-        f"overfit {len(surfaces)} surfaces",
-        resuming=(folder / CHECKPOINT_FILE).exists(),
-    )
-    return module, trainer
+    with ExitStack() as locks:
+        for folder in sorted(missing):  # in one order, whoever else wants them
+            locks.enter_context(FileLock(folder.with_suffix(".lock")))
+        left = {folder: s for folder, s in missing.items() if not is_complete(folder)}
+        runs = [Run(overfit, folder, resuming=True) for folder in left]
+        if len(runs) < 2 or len({run.stage for run in runs}) > 1 or runs[0].stage is None:
+            return  # what was begun alone goes on alone
+        try:
+            modules, trainer = overfit_together(runs, list(left.values()), console)
+        except Parted as fault:
+            console.print(f"{fault}; each goes on alone")
+            return
+        for i, (run, surface, module) in enumerate(zip(runs, left.values(), modules, strict=True)):
+            leave_results(overfit, run.folder, surface, module, trainer, console, started, index=i)
 
 
 def _settings_of_phi(config: DictConfig) -> DictConfig:

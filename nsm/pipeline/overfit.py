@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytorch_lightning as pl
 from omegaconf import DictConfig
 from rich.console import Console
 
+from nsm.data import SeveralData
+from nsm.maps.networks import SKIPS
 from nsm.pipeline.common import (
+    Run,
     built,
     configured_surface,
     plain,
     report_surface,
     train,
+    trained,
     with_map,
     write_figures,
 )
@@ -31,8 +38,10 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.surfaces import Surface
-from nsm.tasks import Overfit
+from nsm.tasks import Overfit, OverfitSeveral
 from nsm.tasks.least_squares import fit_readout
+from nsm.tasks.optimizers import shared_options
+from nsm.tasks.several import Several
 
 
 def run_overfit(
@@ -60,32 +69,124 @@ def run_overfit(
     report_surface(console, surface)
     module = build_overfit(config, surface)
     shown = surface
-    trainer = train(
-        config,
-        folder,
-        surface,
-        module,
-        console,
-        Pictures(
-            "surface",
-            lambda m: reconstruction_image(shown, m, size=384),  # type: ignore[arg-type]
-            config.logger.pictures,
-        ),
-        resuming=resuming,
-    )
+    pictures = _pictures(config, lambda module: shown)
+    trainer = train(config, folder, surface, module, console, pictures, resuming=resuming)
+    return leave_results(config, folder, surface, module, trainer, console, started)
+
+
+def leave_results(
+    config: DictConfig,
+    folder: Path,
+    surface: Surface,
+    module: Overfit,
+    trainer: pl.Trainer,
+    console: Console,
+    started: float,
+    *,
+    index: int = 0,
+) -> NeuralSurface:
+    """Measure a trained network, and leave its results in the run folder.
+
+    Args:
+        config, folder, surface, module: of the run.
+        trainer: that has trained it, or several in one batch, of which it is number ``index``.
+        console: where to print.
+        started: when the run began, by ``time.monotonic``.
+        index: see ``trainer``.
+    """
     phi = module.map.cpu().eval().requires_grad_(False)
     neural = NeuralSurface(surface, phi, overfit_metrics(surface, phi), plain(config))
     save_surface(folder, neural)
     if config.artefacts:
         _write_artefacts(folder, neural)
-    write_figures(config, folder, surface, trainer, started, {"metrics": neural.metrics})
+    figures: dict[str, Any] = {"metrics": neural.metrics}
+    if isinstance(trainer.lightning_module, Several):
+        figures["together"] = len(trainer.lightning_module.each)
+    write_figures(config, folder, surface, trainer, started, figures, index)
     console.print(metrics_table(neural.metrics))
     console.print(f"results in {folder}", soft_wrap=True)
     return neural
 
 
-def build_overfit(config: DictConfig, surface: Surface) -> Overfit:
+def common_settings(settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What the settings of trainings must have in common to be made in one batch.
+
+    Surface, seed, λ_n and the optimiser's rates may differ.
+
+    Args:
+        settings: the whole configuration, as plain dictionaries and lists.
+
+    Returns:
+        None if the training has to be made alone.
+    """
+    trainer, optimizer = settings["trainer"], shared_options(settings["optimizer"])
+    whole = (trainer["stop_gradient_norm"], trainer["gradient_clip"])  # look at all gradients
+    if (
+        settings["task"]["name"] != "overfit"
+        or settings["map"]["block"] not in SKIPS
+        or optimizer is None
+        or trainer["devices"] > 1
+        or whole != (None, None)
+        or "wandb" in settings["logger"]["kinds"]  # one run at a time
+    ):
+        return None
+    own = ("surface", "domain", "seed", "artefacts", "resume")
+    energy = {key: v for key, v in settings["energy"].items() if key != "lambda_normal"}
+    rest = {key: value for key, value in settings.items() if key not in own}
+    return {**rest, "energy": energy, "optimizer": optimizer}
+
+
+def overfit_together(
+    runs: Sequence[Run], surfaces: Sequence[Surface], console: Console
+) -> tuple[list[Overfit], pl.Trainer]:
+    """Train several networks in one batch, each in its run folder, as each would be alone.
+
+    Args:
+        runs: with :func:`common_settings`, and checkpoints of one step if they go on.
+        surfaces: of each.
+        console: where to print.
+
+    Returns:
+        The trained modules, and the trainer, for :func:`leave_results`.
+
+    Raises:
+        NsmError: settings that do not fit together.
+        Parted: some have to be trained alone; all have whole checkpoints, if any.
+    """
+    config = runs[0].config
+    modules: list[Overfit] = []
+    starts: dict[tuple[int, int], Overfit] = {}
+    for run, surface in zip(runs, surfaces, strict=True):
+        place = id(surface), run.config.seed
+        modules.append(build_overfit(run.config, surface, start=starts.get(place)))
+        starts.setdefault(place, modules[-1])
+    surface_of = dict(zip(modules, surfaces, strict=True))
+    seeds = [run.config.seed for run in runs]
+    trainer = trained(
+        runs,
+        SeveralData(surfaces, seeds, **plain(config)["data"]),
+        OverfitSeveral(modules),
+        console,
+        _pictures(config, lambda module: surface_of[module]),
+        f"overfit {len(runs)} networks",
+    )
+    return modules, trainer
+
+
+def _pictures(config: DictConfig, surface_of: Callable[[Any], Surface]) -> Pictures:
+    def draw(module: Any) -> np.ndarray:
+        return reconstruction_image(surface_of(module), module, size=384)
+
+    return Pictures("surface", draw, config.logger.pictures)
+
+
+def build_overfit(config: DictConfig, surface: Surface, start: Overfit | None = None) -> Overfit:
     """The overfit task's module, seeded, and fitted where ``map.readout`` says so.
+
+    Args:
+        config, surface: of the run.
+        start: a module of the same surface, seed and network that is not trained yet, whose fit is
+            taken.
 
     Raises:
         NsmError: settings of the network, optimiser or schedule that do not fit together.
@@ -97,7 +198,9 @@ def build_overfit(config: DictConfig, surface: Surface) -> Overfit:
             lambda_normal=float(config.energy.lambda_normal),
             diagonal=surface.bounding_box_diagonal,
         )
-        if config.map.readout == "fitted":
+        if start is not None:
+            module.load_state_dict(start.state_dict())
+        elif config.map.readout == "fitted":
             fit_readout(module.map, surface, seed=config.seed)
         return module
 

@@ -16,18 +16,20 @@ from torch.optim import Optimizer
 
 from nsm.errors import NsmError
 from nsm.results.files import flush_folder
-from nsm.results.loggers import log_picture
+from nsm.results.loggers import log_picture, loggers_of
+from nsm.tasks.several import Several, apart
 
 
 class AtomicCheckpoint(Callback):
     """Keep the last state of the training after each epoch, whole at any moment.
 
     Args:
-        path: the checkpoint file; written beside it first, then moved into its place.
+        paths: the checkpoint file, or that of each of several trainings in one batch; written
+            beside it first, then moved into its place.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, *paths: Path) -> None:
+        self.paths = paths
 
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
@@ -36,27 +38,33 @@ class AtomicCheckpoint(Callback):
         trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        temporary = self.path.with_suffix(".tmp")
+        for index, path in enumerate(self.paths):
+            if isinstance(pl_module, Several):
+                pl_module.shown = index
+            self._save(trainer, path)
+
+    def _save(self, trainer: pl.Trainer, path: Path) -> None:
+        temporary = path.with_suffix(".tmp")
         try:
             trainer.save_checkpoint(temporary)
             if not trainer.is_global_zero:
                 return
             with temporary.open("rb") as stream:
                 os.fsync(stream.fileno())
-            os.replace(temporary, self.path)
-            flush_folder(self.path.parent)
+            os.replace(temporary, path)
+            flush_folder(path.parent)
         except (OSError, RuntimeError) as error:  # torch has RuntimeError for a full disk
             temporary.unlink(missing_ok=True)
             reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:120]
             raise NsmError(
-                f"{self.path}: the checkpoint of step {trainer.global_step} cannot be written "
+                f"{path}: the checkpoint of step {trainer.global_step} cannot be written "
                 f"({reason}); the one before, if any, is whole. Free some space, then go on with: "
-                f"nsm resume={self.path.parent}"
+                f"nsm resume={path.parent}"
             ) from error
 
 
 class GradientWatch(Callback):
-    """Log the gradient's norm, and stop by it.
+    """Log the gradient's norm, of each of several trainings, and stop by it, where there is one.
 
     Args:
         every: steps between two values in the log.
@@ -74,13 +82,14 @@ class GradientWatch(Callback):
         logging = (trainer.global_step + 1) % self.every == 0  # the steps that Lightning keeps
         if not logging and self.stop_norm is None:
             return
-        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
-        if not gradients:  # taken back, as not finite (see Faults)
-            return
-        norm = float(torch.nn.utils.get_total_norm(gradients))
-        self.recent.append(norm)
-        if logging:
-            pl_module.log("train/gradient_norm", norm)
+        for end, module in apart(pl_module).items():
+            gradients = [p.grad for p in module.parameters() if p.grad is not None]
+            if not gradients:  # taken back, as not finite (see Faults)
+                return
+            norm = float(torch.nn.utils.get_total_norm(gradients))
+            self.recent.append(norm)
+            if logging:
+                pl_module.log(f"train/gradient_norm{end}", norm)
 
     def on_train_batch_end(
         self,
@@ -107,7 +116,8 @@ class Pictures(Callback):
 
     Args:
         name: of the pictures.
-        draw: from the module to a picture (H, W, 3) uint8.
+        draw: from the module, or that of each of several trainings in one batch, to a picture
+            (H, W, 3) uint8.
         count: how many pictures in all.
     """
 
@@ -124,7 +134,9 @@ class Pictures(Callback):
         if due <= self.taken:
             return
         self.taken = due
-        log_picture(trainer.loggers, self.name, self.draw(pl_module), trainer.global_step)
+        for index, module in enumerate(apart(pl_module).values()):
+            picture = self.draw(module)  # type: ignore[arg-type]
+            log_picture(loggers_of(trainer.loggers, index), self.name, picture, trainer.global_step)
 
     def state_dict(self) -> dict[str, Any]:
         return {"taken": self.taken}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import pytorch_lightning as pl
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
+from nsm.tasks.several import Parted, Several
 
 _EVERY = 50  # steps between two states that are kept
 _TRIES = 5
@@ -24,7 +26,8 @@ class Faults(Callback):
 
     A state is kept in memory, and in the checkpoint, every few steps, once the loss and gradient
     there are known to be finite. The step that fails changes nothing: weights, optimiser and
-    buffers return to the kept state, and all learning rates are halved.
+    buffers return to the kept state, and all learning rates are halved. Of several trainings in one
+    batch, what fails has to be trained alone, and is then put right so.
 
     Args:
         console: where each fault is told, in one line.
@@ -75,6 +78,7 @@ class Faults(Callback):
         self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: Optimizer
     ) -> None:
         step = trainer.global_step
+        _part(module, lambda p: p.grad, f"step {step}: the loss or its gradient is not finite")
         if self.good is None:
             raise NsmError(
                 f"the loss or its gradient is not finite at the first step, {step}; check the "
@@ -124,6 +128,7 @@ class Faults(Callback):
         trained = [p for p in pl_module.parameters() if p.requires_grad]
         if self.good is None or all(bool(torch.isfinite(p).all()) for p in trained):
             return
+        _part(pl_module, lambda p: p if p.requires_grad else None, "the last step was not finite")
         self._restore(pl_module)
         self.rollbacks.append({"step": trainer.global_step, "back_to": self.good["step"]})
         self.console.print(f"the last step was not finite; back to step {self.good['step']}")
@@ -131,9 +136,50 @@ class Faults(Callback):
     def state_dict(self) -> dict[str, Any]:
         return {"good": self.good, "rollbacks": self.rollbacks, "parts": self.parts}
 
+    def on_save_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        if self.good is not None and isinstance(pl_module, Several):
+            shown = pl_module.shown
+            checkpoint["callbacks"][self.state_key]["good"] = {
+                **self.good,
+                "module": pl_module.weights_of(self.good["module"], shown),
+                "optimizer": pl_module.shares.of_optimizer(self.good["optimizer"], shown),
+            }
+
+    def on_load_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        if not isinstance(pl_module, Several):
+            return
+        each = [state["callbacks"][self.state_key]["good"] for state in pl_module.stored]
+        joint = None
+        if len({good and good["step"] for good in each}) == 1 and each[0]:
+            joint = {
+                **each[0],
+                "module": pl_module.weights([good["module"] for good in each]),
+                "optimizer": pl_module.shares.optimizer([good["optimizer"] for good in each]),
+            }
+        checkpoint["callbacks"][self.state_key]["good"] = joint
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.good, self.rollbacks = state_dict["good"], list(state_dict["rollbacks"])
         self.parts = state_dict["parts"]
+
+
+def _part(
+    module: pl.LightningModule, looked_at: Callable[[Tensor], Tensor | None], reason: str
+) -> None:
+    """Of several trainings, leave those alone that have something that is not finite; all, where it
+    is not seen which."""
+    if not isinstance(module, Several):
+        return
+    bad = []
+    for i, one in enumerate(module.each):
+        seen = [t for p in one.parameters() if (t := looked_at(p)) is not None]
+        if not all(bool(torch.isfinite(t).all()) for t in seen):
+            bad.append(i)
+    raise Parted(reason, bad or range(len(module.each)))
 
 
 def faults_of(trainer: pl.Trainer) -> dict[str, Any]:

@@ -123,6 +123,53 @@ def _identify(folder: Path, **words: Any) -> None:
     atomic_write(folder / IDENTITY_FILE, as_json({**_identity(folder), **words}))
 
 
+class Distributed(Logger):
+    """The loggers of several trainings in one batch: ``NAME@i`` goes to those of training i, as
+    ``NAME``, and what has no such ending to all.
+
+    Args:
+        each: the loggers of each training.
+    """
+
+    def __init__(self, each: Sequence[Sequence[Logger]]) -> None:
+        super().__init__()
+        self.each = each
+
+    @property
+    def name(self) -> str | None:
+        return None
+
+    @property
+    def version(self) -> str | None:
+        return None
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        for index, loggers in enumerate(self.each):
+            ended = [(*name.partition("@"), value) for name, value in metrics.items()]
+            own = {name: value for name, at, i, value in ended if not at or int(i) == index}
+            for logger in loggers:
+                logger.log_metrics(own, step)
+
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
+        """Each logger has the settings of its own training."""
+
+    def save(self) -> None:
+        for logger in self._all():
+            logger.save()
+
+    def finalize(self, status: str) -> None:
+        close(self._all(), status)
+
+    def _all(self) -> list[Logger]:
+        return [logger for loggers in self.each for logger in loggers]
+
+
+def loggers_of(loggers: Sequence[Logger], index: int) -> Sequence[Logger]:
+    """The loggers of training ``index``, where there are several in one batch, or of the one."""
+    first = loggers[0] if loggers else None
+    return first.each[index] if isinstance(first, Distributed) else loggers
+
+
 def log_picture(loggers: Sequence[Logger], name: str, image: np.ndarray, step: int) -> None:
     """Put a picture (H, W, 3) uint8 into the logs that take pictures."""
     for logger in loggers:

@@ -34,7 +34,8 @@ class Throughput(Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        of_process = len(batch[0] if isinstance(batch, tuple) else batch)
+        points = batch[0] if isinstance(batch, tuple) else batch
+        of_process = points.shape[-2]  # of several trainings in one batch, what each has
         self.samples += of_process * trainer.world_size
         due = trainer.global_step % self.every == 0
         if due:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
-import pytorch_lightning as pl
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nsm.data import Samples
 from nsm.energies.overfit import normal, position
 from nsm.maps import build_map, together
 from nsm.tasks.optimizers import configure
+from nsm.tasks.several import Several
 from nsm.tasks.terms import Term
 from nsm.tasks.training import Training
 
@@ -57,16 +57,11 @@ class Overfit(Training):
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         value, jacobian = self.map.value_and_jacobian(batch.uv)
-        squared = position(value, batch.points).mean()
-        cross = torch.linalg.cross(jacobian[:, :, 0], jacobian[:, :, 1])
-        cosine = torch.nn.functional.cosine_similarity(cross, batch.normals)
-        angle = torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean()
-        self.log("val/mean_squared_distance", squared, batch_size=len(value))
-        self.log("val/normal_error_degrees", angle, batch_size=len(value))
+        self.log_dict(_held_out(value, jacobian, batch), batch_size=len(value))
 
     def on_validation_epoch_end(self) -> None:
         # the root is taken after the mean over all batches
-        squared = self.trainer.callback_metrics["val/mean_squared_distance"]
+        squared = self.trainer.callback_metrics[_SQUARED]
         self.log("val/rms_percent", 100 * squared.sqrt() / self.diagonal)
 
     def configure_optimizers(self) -> Any:
@@ -74,85 +69,79 @@ class Overfit(Training):
 
 
 def _terms(
-    value: Tensor, jacobian: Tensor | None, batch: Samples, lambda_normal: float
+    value: Tensor, jacobian: Tensor | None, batch: Samples, lambda_normal: float | Tensor
 ) -> dict[str, Term]:
-    """The terms of Eq. 1, that of normals where there are Jacobians (..., N, 3, 2): means over N
-    samples, summed over the surfaces where there are several."""
+    """The terms of Eq. 1 for values (..., N, 3), that of normals where there are Jacobians
+    (..., N, 3, 2): means over N samples, (...)."""
     terms: dict[str, Term] = {
-        "position": (1.0, position(value, batch.points).mean(dim=-1).sum()),
+        "position": (1.0, position(value, batch.points).mean(dim=-1)),
     }
     if jacobian is not None:
-        turn = normal(jacobian, batch.normals).mean(dim=-1).sum()
-        terms["normal"] = (lambda_normal, turn)
+        terms["normal"] = (lambda_normal, normal(jacobian, batch.normals).mean(dim=-1))
     return terms
 
 
-class OverfitSeveral(Training):
+_SQUARED = "val/mean_squared_distance"
+
+
+def _held_out(value: Tensor, jacobian: Tensor, batch: Samples) -> dict[str, Tensor]:
+    """Errors at held-out points, for the log: means over N samples, (...)."""
+    cross = torch.linalg.cross(jacobian[..., 0], jacobian[..., 1])
+    cosine = torch.nn.functional.cosine_similarity(cross, batch.normals, dim=-1)
+    return {
+        _SQUARED: position(value, batch.points).mean(dim=-1),
+        "val/normal_error_degrees": torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean(dim=-1),
+    }
+
+
+class OverfitSeveral(Several):
     """k surfaces at once, each as :class:`Overfit` has it, with the networks in one batch.
 
-    The loss is the sum of theirs and no network sees another's share of it, so that each becomes
-    what it would alone.
-
     Args:
-        seed: of each network's start.
-        map, optimizer, scheduler, lambda_normal, max_steps: of each, as for :class:`Overfit`.
-        diagonals: of the surfaces' bounding boxes, the units of the errors that are logged.
+        each: their modules, with networks of one configuration; seeds, λ_n and the optimiser's
+            rates may differ.
     """
 
     progress_figure, progress_form = "val/rms_percent", "largest error {:.3f} %"
 
-    def __init__(
-        self,
-        seed: int,
-        map: dict[str, Any],
-        optimizer: dict[str, Any],
-        scheduler: dict[str, Any],
-        lambda_normal: float,
-        max_steps: int,
-        diagonals: Sequence[float],
-    ) -> None:
-        super().__init__()
-        self.save_hyperparameters(logger=False)
-        self.maps = nn.ModuleList()
-        for _ in diagonals:
-            pl.seed_everything(seed, verbose=False)
-            self.maps.append(build_map(map))
-        self.lambda_normal = lambda_normal
-        self.register_buffer("units", torch.tensor(diagonals), persistent=False)
+    def __init__(self, each: Sequence[Overfit]) -> None:
+        super().__init__(each)
+        self._together = (together([one.map for one in each]),)  # no module of its own
+        self.some_normals = any(one.lambda_normal != 0 for one in each)
+        lambdas, units = ([getattr(o, a) for o in each] for a in ("lambda_normal", "diagonal"))
+        self.register_buffer("lambda_normal", torch.tensor(lambdas), persistent=False)
+        self.register_buffer("units", torch.tensor(units), persistent=False)
 
+    lambda_normal: Tensor
     units: Tensor
-
-    def forward(self, uv: Tensor) -> Tensor:
-        """(k, N, 2) points, N of each surface's Ω, to (k, N, 3)."""
-        every: Tensor = together(list(self.maps))(uv)
-        return every
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
         value, jacobian = self._evaluated(batch.uv)
-        with_normals = jacobian if self.lambda_normal > 0 else None
-        return self.summed(_terms(value, with_normals, batch, self.lambda_normal))
+        with_normals = jacobian if self.some_normals else None
+        return self.summed(_terms(value, with_normals, batch, self.lambda_normal)).sum()
 
     def _evaluated(self, uv: Tensor) -> tuple[Tensor, ...]:
         """Values (k, N, 3) and Jacobians (k, N, 3, 2)."""
 
         def by_point(x: Tensor) -> tuple[Tensor, ...]:
-            both = together(list(self.maps)).value_and_jacobian(x.transpose(0, 1))
+            both = self._together[0].value_and_jacobian(x.transpose(0, 1))
             return tuple(part.transpose(0, 1) for part in both)
 
         return tuple(part.transpose(0, 1) for part in self.pointwise(by_point, uv.transpose(0, 1)))
 
+    def tells(self, index: int, name: str) -> bool:
+        return not name.endswith("/normal") or cast(Overfit, self.each[index]).lambda_normal != 0
+
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        value = self(batch.uv)
-        for k, squared in enumerate(position(value, batch.points).mean(dim=1)):
-            self.log(f"val/mean_squared_distance_{k}", squared, batch_size=value.shape[1])
+        value, jacobian = self._together[0].value_and_jacobian(batch.uv)
+        figures = _held_out(value, jacobian, batch)
+        for name, values in figures.items():
+            for i, value in enumerate(values):
+                self.log(f"{name}@{i}", value, batch_size=batch.uv.shape[1])
 
     def on_validation_epoch_end(self) -> None:
-        squared = [
-            self.trainer.callback_metrics[f"val/mean_squared_distance_{k}"]
-            for k in range(len(self.maps))
-        ]
-        error = 100 * torch.stack(squared).sqrt().to(self.units) / self.units
-        self.log("val/rms_percent", error.max())
-
-    def configure_optimizers(self) -> Any:
-        return configure(self.maps, self.hparams)
+        known = self.trainer.callback_metrics
+        squared = torch.stack([known[f"{_SQUARED}@{i}"] for i in range(len(self.each))])
+        error = 100 * squared.sqrt().to(self.units) / self.units
+        self.logged({"val/rms_percent": error})
+        self.log("val/rms_percent", error.max(), logger=False)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nsm.energies import Blend
 
-Term = tuple[float, Tensor]
+Term = tuple[float | Tensor, Tensor]
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,14 @@ class Training(Splitting):
             return self.compiled(function, x)
         return super().pointwise(function, x)
 
-    def note(self, figures: dict[str, Tensor]) -> None:
-        """Log figures of a training step as ``train/NAME``, in the steps that the logger takes."""
+    def note(self, figures: Mapping[str, Tensor], kind: str = "train") -> None:
+        """Log figures of a training step as ``KIND/NAME``, in the steps that the logger takes."""
         if (self.global_step + 1) % self.log_every == 0:
-            self.log_dict({f"train/{name}": value for name, value in figures.items()})
+            self.logged({f"{kind}/{name}": value for name, value in figures.items()})
+
+    def logged(self, figures: Mapping[str, Tensor]) -> None:
+        """Log figures as they are called."""
+        self.log_dict(dict(figures))
 
     def summed(self, terms: Mapping[str, Term]) -> Tensor:
         """The loss Σ λ·term, logged with its terms.
@@ -43,12 +47,12 @@ class Training(Splitting):
         latter add up to ``train/loss``.
 
         Args:
-            terms: by name, λ and the term, a scalar.
+            terms: by name, λ and the term, a scalar, or (k,) of trainings in one batch, as is the
+                loss then.
         """
         parts = {name: weight * value for name, (weight, value) in terms.items()}
         first, *rest = parts.values()
         loss = sum(rest, start=first)
         self.note({**{name: value for name, (_, value) in terms.items()}, "loss": loss})
-        if (self.global_step + 1) % self.log_every == 0:
-            self.log_dict({f"weighted/{name}": part for name, part in parts.items()})
+        self.note(parts, "weighted")
         return loss

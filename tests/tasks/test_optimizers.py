@@ -1,12 +1,19 @@
 """Optimisers and schedules from settings."""
 
+import copy
 import math
 
 import pytest
 import torch
 
 from nsm.maps import build_map
-from nsm.tasks.optimizers import build_optimizer, build_scheduler
+from nsm.tasks.optimizers import (
+    Shares,
+    build_optimizer,
+    build_scheduler,
+    in_one,
+    shared_options,
+)
 
 
 def rates(settings, max_steps, steps):
@@ -158,3 +165,58 @@ def test_lbfgs_solves_a_quadratic_with_grids_and_network_as_one():
 
     optimizer.step(loss)
     assert all(torch.allclose(p, torch.ones_like(p), atol=1e-4) for p in network.parameters())
+
+
+def assert_alike(state, other):
+    assert state["param_groups"] == other["param_groups"]
+    torch.testing.assert_close(state["state"], other["state"])
+
+
+@pytest.mark.parametrize("name", ["adam", "adamw", "rmsprop", "sgd", "muon"])
+@pytest.mark.parametrize("apart", [False, True])
+def test_one_optimiser_makes_the_steps_of_several(name, apart):
+    settings = [{"name": name, "lr": 1e-2, "encoding_lr": 3e-2} for _ in range(3)]
+    if name == "muon" and not hasattr(torch.optim, "Muon"):
+        pytest.skip("torch is older than 2.9")
+    if apart:
+        settings[1]["lr"] = 2e-2
+    common = [shared_options(one) for one in settings]
+    if apart and name == "muon":  # whose matrices are one group
+        assert common[0] != common[1]
+        return
+    assert common[0] == common[1] == common[2]
+    grid = {"name": "spline_grid", "resolutions": [2, 4]}
+    networks = [build_map({"width": 4, "depth": 2, "encoding": grid}) for _ in settings]
+    copies = copy.deepcopy(networks)
+    schedule = {"name": "cosine", "warmup": 3}
+
+    def scheduled(optimizer):
+        return optimizer, build_scheduler(optimizer, schedule, 10)
+
+    alone = [scheduled(build_optimizer(*both)) for both in zip(networks, settings, strict=True)]
+    each = [scheduled(build_optimizer(*both))[0] for both in zip(copies, settings, strict=True)]
+    joint, rates = scheduled(in_one(each))
+    assert len(joint.param_groups) == len(each[0].param_groups) * (3 if apart else 1)
+    for _ in range(4):
+        for network, copied in zip(networks, copies, strict=True):
+            for p, q in zip(network.parameters(), copied.parameters(), strict=True):
+                p.grad = torch.randn_like(p)
+                q.grad = p.grad.clone()
+        for optimizer, scheduler in [*alone, (joint, rates)]:
+            optimizer.step()
+            scheduler.step()
+    for network, copied in zip(networks, copies, strict=True):
+        for p, q in zip(network.parameters(), copied.parameters(), strict=True):
+            torch.testing.assert_close(p, q)
+    shares = Shares(joint, each)
+    states = [shares.of_optimizer(joint.state_dict(), i) for i in range(3)]
+    schedules = [shares.of_schedule(rates.state_dict(), i) for i in range(3)]
+    for (optimizer, scheduler), state, of_schedule in zip(alone, states, schedules, strict=True):
+        assert_alike(state, optimizer.state_dict())
+        assert of_schedule == scheduler.state_dict()
+    assert_alike(shares.optimizer(states), joint.state_dict())
+    assert shares.schedule(schedules) == rates.state_dict()
+
+
+def test_steps_that_depend_on_all_weights_are_made_alone():
+    assert shared_options({"name": "lbfgs", "lr": 1.0}) is None
