@@ -32,9 +32,10 @@ MAP = (
 PHI = "phi.overrides=['experiment=quick','trainer.max_steps=200']"
 BARE = ("artefacts=false",)  # of most: pictures take longer than all the rest
 PICTURED = ("genus 2", "needles 1e-9", "one triangle", "spike 1e7", "scale 1e-25", "slit")
-# all but a line, or folded everywhere: the few steps of the others would reach a part of it
+# all but a line, or folded everywhere: the few steps and the coarse grid of the others would reach
+# a part of it
 LONGER = ("triangles 1e6 : 1", "triangles 1e9 : 1", "spike 1e7", "strip of 2000", "crumpled torus")
-LONG = ("trainer.max_steps=1000",)
+LONG = ("trainer.max_steps=1000", "encoding.resolutions=[32,128,512]")
 SQUARE_TOO = ("genus 3", "10 boundary loops", "needles 1e-6", "open fan of 200", "spike 10")
 
 
