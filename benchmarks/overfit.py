@@ -106,7 +106,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--meshes", type=Path, help="folder with the mesh files; else fetched")
     parser.add_argument("--names", nargs="+", default=list(MESHES), choices=list(MESHES))
-    parser.add_argument("--minutes", nargs="+", type=float, default=[0.5, 1, 5])
+    parser.add_argument("--minutes", nargs="+", type=float, default=[0.5, 1])
     parser.add_argument("--paper-minutes", nargs="+", type=float, default=[1, 5, 15])
     parser.add_argument("--settings", nargs="+", default=["default", "paper"])
     parser.add_argument("--output", type=Path, default=RESULT)
