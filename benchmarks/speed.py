@@ -338,7 +338,7 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
 
     def distortion(module: Any, uv: Tensor) -> float:
         with torch.no_grad():
-            return float(module._distortion(uv)[0])
+            return float(module._distortion(uv)[0].mean)
 
     curves = {"default": [], "paper": []}
     for steps in (25, 50, 100, 200, 400):
