@@ -24,7 +24,7 @@ from nsm.maps import NeuralMap, SplineGrid
 from nsm.maps.encodings import value_and_jacobian_stack
 from nsm.surfaces import Surface
 from nsm.tasks import Overfit
-from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer, build_scheduler
+from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer, scheduled
 
 
 class Candidate(Overfit):
@@ -43,13 +43,7 @@ class Candidate(Overfit):
         return build_optimizer(self.map, dict(self.hparams["optimizer"]))
 
     def configure_optimizers(self) -> Any:
-        optimizer = self.optimizer()
-        settings = dict(self.hparams["scheduler"])
-        scheduler = build_scheduler(optimizer, settings, self.hparams["max_steps"])
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-        }
+        return scheduled(self.optimizer(), self.hparams)
 
 
 # Second order: Gauss–Newton steps, damped

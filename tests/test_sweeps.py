@@ -5,24 +5,13 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from tiny import TRAINING
 
 from hydra_plugins.nsm_sweeps.launchers import _told
 from nsm.config import compose_config, conf_folder
 from nsm.sweeps import job_folder, overrides_of, sweep_folder
 
-TINY = [
-    "surface.path=patch.off",
-    "surface.parameterization=tutte",
-    "experiment=quick",
-    "encoding.resolutions=[4]",
-    "trainer.max_steps=4",
-    "data.steps_per_epoch=4",
-    "data.batch_size=64",
-    "data.held_out=64",
-    "artefacts=false",
-    "logger=none",
-    "trainer.progress=false",
-]
+TINY = [*TRAINING, "data.steps_per_epoch=4", "logger=none"]
 
 
 SQUARE = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"

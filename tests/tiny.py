@@ -13,6 +13,18 @@ from nsm.surfaces import Surface
 from nsm.surfaces.shapes import ring_mesh
 
 NETWORK = {"width": 4, "depth": 1, "block": "plain"}
+# the shortest training, of the surface that is in patch.off
+TRAINING = [
+    "surface.path=patch.off",
+    "surface.parameterization=tutte",
+    "experiment=quick",
+    "encoding.resolutions=[4]",
+    "trainer.max_steps=4",
+    "data.batch_size=64",
+    "data.held_out=64",
+    "artefacts=false",
+    "trainer.progress=false",
+]
 
 
 class Results(NamedTuple):

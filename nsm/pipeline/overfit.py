@@ -18,6 +18,7 @@ from nsm.pipeline.common import (
     Run,
     built,
     configured_surface,
+    frozen,
     plain,
     report_surface,
     train,
@@ -94,7 +95,7 @@ def leave_results(
         started: when the run began, by ``time.monotonic``.
         index: see ``trainer``.
     """
-    phi = module.map.cpu().eval().requires_grad_(False)
+    phi = frozen(module.map)
     neural = NeuralSurface(surface, phi, overfit_metrics(surface, phi), plain(config))
     save_surface(folder, neural)
     if config.artefacts:

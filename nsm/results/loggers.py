@@ -144,8 +144,8 @@ class Distributed(Logger):
         return None
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        ended = [(*name.partition("@"), value) for name, value in metrics.items()]
         for index, loggers in enumerate(self.each):
-            ended = [(*name.partition("@"), value) for name, value in metrics.items()]
             own = {name: value for name, at, i, value in ended if not at or int(i) == index}
             for logger in loggers:
                 logger.log_metrics(own, step)

@@ -57,7 +57,7 @@ class Overfit(Training):
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         value, jacobian = self.map.value_and_jacobian(batch.uv)
-        self.log_dict(_held_out(value, jacobian, batch), batch_size=len(value))
+        self.logged(_held_out(value, jacobian, batch), batch_size=len(value))
 
     def on_validation_epoch_end(self) -> None:
         # the root is taken after the mean over all batches
@@ -134,10 +134,7 @@ class OverfitSeveral(Several):
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         value, jacobian = self._together[0].value_and_jacobian(batch.uv)
-        figures = _held_out(value, jacobian, batch)
-        for name, values in figures.items():
-            for i, value in enumerate(values):
-                self.log(f"{name}@{i}", value, batch_size=batch.uv.shape[1])
+        self.logged(_held_out(value, jacobian, batch), batch_size=value.shape[1])
 
     def on_validation_epoch_end(self) -> None:
         known = self.trainer.callback_metrics

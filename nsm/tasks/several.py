@@ -56,7 +56,7 @@ class Several(Training):
         self.shares = Shares(joint, own)
         return scheduled(joint, each[0].hparams)
 
-    def logged(self, figures: Mapping[str, Tensor]) -> None:
+    def logged(self, figures: Mapping[str, Tensor], batch_size: int | None = None) -> None:
         """Log figures (k,), one for each training."""
         self.log_dict(
             {
@@ -64,7 +64,8 @@ class Several(Training):
                 for name, values in figures.items()
                 for i, value in enumerate(values)
                 if self.tells(i, name)
-            }
+            },
+            batch_size=batch_size,
         )
 
     def tells(self, index: int, name: str) -> bool:

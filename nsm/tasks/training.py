@@ -36,9 +36,9 @@ class Training(Splitting):
         if (self.global_step + 1) % self.log_every == 0:
             self.logged({f"{kind}/{name}": value for name, value in figures.items()})
 
-    def logged(self, figures: Mapping[str, Tensor]) -> None:
-        """Log figures as they are called."""
-        self.log_dict(dict(figures))
+    def logged(self, figures: Mapping[str, Tensor], batch_size: int | None = None) -> None:
+        """Log figures as they are called; means over batches weigh each by its size."""
+        self.log_dict(dict(figures), batch_size=batch_size)
 
     def summed(self, terms: Mapping[str, Term]) -> Tensor:
         """The loss Σ λ·term, logged with its terms.

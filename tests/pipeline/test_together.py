@@ -16,6 +16,7 @@ import torch
 from filelock import FileLock
 from omegaconf import OmegaConf
 from safetensors.torch import load_file
+from tiny import TRAINING
 
 from nsm.config import compose_config
 from nsm.pipeline import overfit
@@ -24,20 +25,12 @@ from nsm.pipeline.together import Call, batches, run_together
 from nsm.results.callbacks import AtomicCheckpoint
 
 TINY = [
-    "surface.path=patch.off",
-    "surface.parameterization=tutte",
-    "experiment=quick",
-    "encoding.resolutions=[4]",
-    "trainer.max_steps=4",
+    *TRAINING,
     "data.steps_per_epoch=2",
-    "data.batch_size=64",
-    "data.held_out=64",
-    "artefacts=false",
     "logger=csv",
     "logger.every=1",
     "logger.pictures=0",
     "scheduler.peak=1",
-    "trainer.progress=false",
 ]
 BENT = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 1\n0 1 0\n3 0 1 2\n3 0 2 3\n"
 
