@@ -103,7 +103,7 @@ def test_an_isometry_is_the_minimum(plane):
     module.log = lambda *args, **kwargs: None
     sampler = SurfaceSampler(plane)
     loss = module.training_step(sampler.by_area(100, sampler.generator(0)), 0)
-    assert float(loss) == pytest.approx(2 + 2 / 1.01, rel=1e-5)
+    assert loss.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
 
 
 def test_a_stretch_is_undone(plane):
