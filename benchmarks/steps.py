@@ -84,7 +84,7 @@ BASE: dict[str, list[str]] = {
 
 # the start by least squares, and small rates from there
 START = ["map.readout=fitted", "encoding.resolutions=[32,128,512]"]
-FITTED = [*START, "+scheduler.peak=0.003"]
+FITTED = [*START, "scheduler.peak=0.003"]
 
 LBFGS = ["optimizer=lbfgs", "scheduler.warmup=0"]
 GAUSS_NEWTON = ["candidate=gauss_newton", "optimizer.lr=1", "scheduler.warmup=0"]
@@ -155,7 +155,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
     },
     # all of grid 32, 128, 512
     "from the fitted start": {
-        "fitted, hardly trained": [*START, "+scheduler.peak=3e-6"],
+        "fitted, hardly trained": [*START, "scheduler.peak=3e-6"],
         "fitted, Muon": [*FITTED, "optimizer=muon"],
         "fitted, SOAP": [*FITTED, *SOAP],
         "fitted, by error": [*FITTED, "candidate=by_error"],

@@ -290,7 +290,7 @@ def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: i
     ``constant``; ``cosine``: one half-wave down to ``final`` of the rate at ``max_steps``;
     ``sgdr``: warm restarts every ``period`` steps, each ``period_factor`` times the one before
     (Loshchilov and Hutter, ICLR 2017). All rise linearly over the first ``warmup`` steps, and are
-    ``peak`` (1 where it is not given) times the optimiser's rates.
+    ``peak`` (by default 1) times the optimiser's rates.
 
     Raises:
         ValueError: the schedule is not known or does not take a parameter.
