@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import cache
+from itertools import permutations
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from tiny import results
 import nsm
 from nsm.config import compose_config
 from nsm.errors import NsmError
-from nsm.pipeline import run_overfit, run_pair_map, run_param
+from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
 from nsm.pipeline.alone import alone
 from nsm.results import analytic
 from nsm.results.analytic import analytic_surface
@@ -227,11 +228,17 @@ MAP_WORDS += ["artefacts=false", "map.width=8", "map.depth=1"]
 
 def mapped(task, folder, resuming=False):
     """What a map's training ends at: the weights, and where the vertices go."""
-    phi, psi, _ = tiny_surfaces()
+    phi, psi, _ = neural = tiny_surfaces()
     config = compose_config([f"task={task}", *MAP_WORDS])
     if task == "param":
         result = run_param(config, folder, phi, resuming=resuming)
         return {**result.map.state_dict(), "uv": torch.from_numpy(result.uv)}
+    if task == "collection_map":
+        marks = [[0, 9], [0, 8], [0, 9]]
+        trio = run_collection_map(config, folder, neural, marks, resuming=resuming)
+        found = {(i, key): w for i, h in enumerate(trio.maps) for key, w in h.state_dict().items()}
+        images = {(i, j): trio.pair(i, j).image_uv for i, j in permutations(range(3), 2)}
+        return found | {ends: torch.from_numpy(uv) for ends, uv in images.items()}
     result = run_pair_map(config, folder, phi, psi, [(0, 0), (9, 8)], resuming=resuming)
     return {**result.map.state_dict(), "uv": torch.from_numpy(result.image_uv)}
 
@@ -272,7 +279,7 @@ class Calls:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-@pytest.mark.parametrize("task", ["param", "pair_map"])
+@pytest.mark.parametrize("task", ["param", "pair_map", "collection_map"])
 def test_a_map_killed_at_random_moments_ends_at_the_same_result(tmp_path, task):
     """Whatever it was doing: training, saving, certifying, writing its results."""
     mapped(task, tmp_path / "first")  # what is imported late is imported now
