@@ -29,9 +29,9 @@ from nsm.surfaces.correspondence import (
     turned_alike,
 )
 from nsm.surfaces.cutting import cut_along_paths
+from nsm.surfaces.domain import Keys
 from nsm.surfaces.landmarks import read_landmarks
 from nsm.surfaces.loading import load_mesh
-from nsm.surfaces.parameterization import Keys
 from nsm.surfaces.together import common_fractions
 from nsm.surfaces.validation import CleanMesh, clean
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nsm.surfaces import Surface
-from nsm.surfaces.parameterization import boundary_self_intersections
+from nsm.surfaces.flat import boundary_self_intersections
 from nsm.surfaces.topology import boundary_loops
 from nsm.surfaces.untangle import flipped, in_order, order_violations, untangled
 

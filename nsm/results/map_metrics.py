@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from nsm.energies import area, singular_value_ratio, symmetric_dirichlet
-from nsm.surfaces.parameterization import boundary_self_intersections, signed_areas
+from nsm.surfaces.flat import boundary_self_intersections, signed_areas
 from nsm.surfaces.topology import boundary_loops, face_areas
 
 

@@ -21,8 +21,8 @@ from nsm.energies import (
 )
 from nsm.results.map_metrics import triangle_metric
 from nsm.surfaces import Surface
+from nsm.surfaces.flat import signed_areas
 from nsm.surfaces.location import locate
-from nsm.surfaces.parameterization import signed_areas
 from nsm.surfaces.topology import boundary_loops, face_areas
 
 ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (

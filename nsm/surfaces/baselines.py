@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nsm.surfaces import topology
-from nsm.surfaces.parameterization import boundary_positions, signed_areas
+from nsm.surfaces.domain import boundary_positions
+from nsm.surfaces.flat import signed_areas
 
 SLIM_ITERATIONS = 200
 ARAP_ROUNDS = 30

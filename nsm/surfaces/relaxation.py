@@ -1,6 +1,6 @@
 """Flat meshes whose vertices move one by one to where their triangles are least distorted.
 
-The energy is that of :mod:`nsm.surfaces.parameterization`: symmetric Dirichlet, weighted by the
+The energy is that of :mod:`nsm.surfaces.sliding`: symmetric Dirichlet, weighted by the
 area on the mesh. Vertices that are no neighbours move at once; a step that would flip a triangle
 or not lower the energy is shortened, or not made.
 """

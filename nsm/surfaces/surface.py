@@ -17,17 +17,11 @@ from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.cutting import Cut, cut_to_disc
+from nsm.surfaces.domain import DOMAIN_AREA, DOMAINS, Keys
+from nsm.surfaces.flat import boundary_self_intersections, flipped_triangles
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
-from nsm.surfaces.parameterization import (
-    DOMAIN_AREA,
-    DOMAINS,
-    METHODS,
-    Keys,
-    boundary_self_intersections,
-    flipped_triangles,
-    parameterize,
-)
+from nsm.surfaces.parameterization import METHODS, parameterize
 from nsm.surfaces.validation import clean
 
 

@@ -21,15 +21,10 @@ from nsm.surfaces.correspondence import (
     turned_alike,
 )
 from nsm.surfaces.cutting import Cut, cut_along_paths
+from nsm.surfaces.domain import DOMAIN_AREA, Keys, at_fractions, fractions_of
 from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.location import locate
-from nsm.surfaces.parameterization import (
-    DOMAIN_AREA,
-    Keys,
-    at_fractions,
-    fractions_of,
-    parameterize,
-)
+from nsm.surfaces.parameterization import parameterize
 from nsm.surfaces.surface import Surface
 from nsm.surfaces.validation import CleanMesh, clean
 

@@ -13,7 +13,7 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from nsm.surfaces.parameterization import at_fractions, fractions_of
+from nsm.surfaces.domain import at_fractions, fractions_of
 from nsm.surfaces.predicates import orientation
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from thorough import examples
 
 from nsm.errors import NsmError
-from nsm.maps.analytic import ANALYTIC, build_analytic, parse_expression
+from nsm.maps.analytic import ANALYTIC, build_analytic
+from nsm.maps.expressions import parse_expression
 
 EXPRESSIONS = [
     "0.3*sin(3*u)*v",

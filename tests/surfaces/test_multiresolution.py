@@ -5,15 +5,15 @@ import pytest
 
 from nsm.surfaces import Surface, parameterization, shapes, topology
 from nsm.surfaces.coarsening import Rings, coarsen, present_faces, undo
-from nsm.surfaces.multiresolution import laid_out
-from nsm.surfaces.parameterization import (
-    boundary_positions,
+from nsm.surfaces.domain import boundary_positions
+from nsm.surfaces.flat import (
     boundary_self_intersections,
     flipped_triangles,
     symmetric_dirichlet_per_face,
-    tutte,
 )
+from nsm.surfaces.multiresolution import laid_out
 from nsm.surfaces.relaxation import Slopes, Stars, relax
+from nsm.surfaces.tutte import tutte
 
 
 def bumpy(n: int = 60) -> tuple[np.ndarray, np.ndarray]:

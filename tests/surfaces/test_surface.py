@@ -16,13 +16,13 @@ from thorough import examples
 from nsm.errors import NsmError
 from nsm.surfaces import Surface, cache, catalogue, catalogue_names, topology
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.loading import load_mesh
-from nsm.surfaces.parameterization import (
+from nsm.surfaces.flat import (
     boundary_self_intersections,
     flipped_triangles,
     symmetric_dirichlet_per_face,
-    tutte,
 )
+from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.tutte import tutte
 
 SHAPES = ["plane", "hemisphere", "sphere", "torus", "cylinder", "cone", "saddle", "terrain"]
 

@@ -15,7 +15,7 @@ from nsm.surfaces.correspondence import (
     turned_alike,
 )
 from nsm.surfaces.cutting import cut_along_paths
-from nsm.surfaces.parameterization import at_fractions
+from nsm.surfaces.domain import at_fractions
 from nsm.surfaces.together import Mesh, matched_landmarks, prepare_together
 
 

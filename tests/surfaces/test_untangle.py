@@ -106,7 +106,7 @@ def test_what_cannot_be_untangled_is_given_back_for_the_caller_to_count():
 def test_a_boundary_is_put_in_order_along_the_domain(seed, size, domain):
     random = np.random.default_rng(seed)
     t = np.arange(40) / 40
-    from nsm.surfaces.parameterization import at_fractions, fractions_of
+    from nsm.surfaces.domain import at_fractions, fractions_of
 
     rest = at_fractions(t, domain)
     jumbled = at_fractions(np.mod(t + 0.3 + size * (random.random(40) - 0.5), 1), domain)

@@ -1,0 +1,77 @@
+"""Flat meshes, uv (V,2) with faces (F,3): what tells whether they are injective, and how much a map
+from them to the surface distorts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nsm.surfaces.predicates import orientation
+
+
+def signed_areas(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Signed areas (F,) of the triangles of a flat mesh (V,2)."""
+    a, b, c = (uv[faces[:, k]] for k in range(3))
+    return 0.5 * (
+        (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    )
+
+
+def flipped_triangles(uv: np.ndarray, faces: np.ndarray) -> int:
+    """Number of triangles whose signed area in the plane is not positive."""
+    return int((~(signed_areas(uv, faces) > 0)).sum())
+
+
+def boundary_self_intersections(uv: np.ndarray, loop: np.ndarray) -> int:
+    """Number of pairs of sides of the closed polygon uv[loop] (B,2) that cross or touch.
+
+    Neighbouring sides share a point by right and are counted only if they fold back.
+    """
+    p = uv[loop]
+    q = np.roll(p, -1, axis=0)
+    n = len(p)
+    side = q - p
+    following = np.roll(side, -1, axis=0)
+    straight = orientation(p, q, np.roll(q, -1, axis=0)) == 0
+    folded = straight & ((side * following).sum(axis=1) <= 0)
+    total = int(folded.sum())
+    low, high = np.minimum(p, q), np.maximum(p, q)
+    for i in range(n - 2):
+        last = n - 1 if i == 0 else n  # the last side is a neighbour of the first
+        j = np.arange(i + 2, last)
+        j = j[((low[j] <= high[i]) & (high[j] >= low[i])).all(axis=1)]
+        if len(j) == 0:
+            continue
+        d1, d2 = orientation(p[i], q[i], p[j]), orientation(p[i], q[i], q[j])
+        d3, d4 = orientation(p[j], q[j], p[i]), orientation(p[j], q[j], q[i])
+        total += int(((d1 * d2 <= 0) & (d3 * d4 <= 0)).sum())
+    return total
+
+
+def symmetric_dirichlet_per_face(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, eps: float = 0.01
+) -> np.ndarray:
+    """tr(M) + tr((M + eps I)^-1) per face (F,), M = J'J of the map from uv (V,2) to 3D.
+
+    About 4 where the map is an isometry; inf where a triangle of uv has no area.
+    """
+    a, b, c = (faces[:, k] for k in range(3))
+    flat = np.stack([uv[b] - uv[a], uv[c] - uv[a]], axis=2)
+    space = np.stack([vertices[b] - vertices[a], vertices[c] - vertices[a]], axis=2)
+    determinant = flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = (
+            np.stack(
+                [
+                    np.stack([flat[:, 1, 1], -flat[:, 0, 1]], axis=1),
+                    np.stack([-flat[:, 1, 0], flat[:, 0, 0]], axis=1),
+                ],
+                axis=1,
+            )
+            / determinant[:, None, None]
+        )
+        jacobian = space @ inverse
+        metric = np.swapaxes(jacobian, 1, 2) @ jacobian
+        trace = metric[:, 0, 0] + metric[:, 1, 1]
+        p, r = metric[:, 0, 0] + eps, metric[:, 1, 1] + eps
+        value = trace + (p + r) / (p * r - metric[:, 0, 1] ** 2)
+    return np.where(determinant != 0, value, np.inf)
