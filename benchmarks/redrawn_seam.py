@@ -101,7 +101,7 @@ def redrawn(
     return [
         nsm.Surface.from_cut(
             cut,
-            mesh.source_vertex,
+            mesh,
             name=name,
             domain="disc",
             parameterization="slim",

@@ -221,7 +221,8 @@ def same_map(a: torch.nn.Module, b: torch.nn.Module) -> None:
 
 def same_surface(a: NeuralSurface, b: NeuralSurface) -> None:
     same_map(a.map, b.map)
-    for name in ("vertices", "faces", "uv", "source_vertex", "twins", "center", "scale"):
+    arrays = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "twins", "center", "scale")
+    for name in arrays:
         assert np.array_equal(getattr(a.surface, name), getattr(b.surface, name))
     assert (a.surface.name, a.surface.domain) == (b.surface.name, b.surface.domain)
 

@@ -255,6 +255,7 @@ def test_a_map_that_is_none(copy, map_):
     "arrays",
     [
         {"surface__source_vertex": np.array([2**60])},
+        {"surface__cut_vertex": np.array([2**60])},
         {"surface__faces": np.array([[0, 1, 10**6]])},
         {"surface__faces": np.zeros((1, 3))},
         {"surface__center": np.array([np.nan, 0, 0])},
@@ -262,7 +263,7 @@ def test_a_map_that_is_none(copy, map_):
     ],
 )
 def test_arrays_that_are_no_surface(copy, arrays):
-    if "surface__source_vertex" in arrays:
+    if {"surface__source_vertex", "surface__cut_vertex"} & set(arrays):
         count = len(load_file(copy / "surface.safetensors")["surface.vertices"])
         arrays = {k: np.repeat(v, count) for k, v in arrays.items()}
     with_arrays(copy, **arrays)

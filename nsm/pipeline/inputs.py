@@ -76,10 +76,8 @@ def read_shape(given: Any, domain: str, key: str) -> Shape:
 
 
 def vertex_count(shape: Shape) -> int:
-    """How many vertices the mesh file of a shape has, up to the last that is on its surface."""
-    if isinstance(shape, Mesh):
-        return int(shape.faces.max()) + 1
-    return int(shape.surface.source_vertex.max()) + 1
+    """How many vertices the mesh file of a shape has."""
+    return len(shape.vertices if isinstance(shape, Mesh) else shape.surface.cut_vertex)
 
 
 def landmark_vertices(given: Any, shapes: Sequence[Shape]) -> list[np.ndarray]:
@@ -153,8 +151,7 @@ def _vertices(given: Landmarks, shape: Shape) -> np.ndarray:
     surface = shape.surface
     if isinstance(given, list):
         surface.preimages(given)  # tells which one is not there
-        places = {int(v): k for k, v in enumerate(surface.source_vertex)}
-        as_vertices([places[int(v)] for v in given], surface.vertices, surface.name)
+        as_vertices(surface.cut_vertex[given], surface.vertices, surface.name)
         return np.asarray(given, dtype=np.int64)
     known = np.flatnonzero(surface.source_vertex >= 0)
     points = shape.in_original_units(surface.vertices[known])

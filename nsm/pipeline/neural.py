@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from filelock import FileLock
@@ -72,7 +73,8 @@ def _made(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurf
     with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
         if is_complete(folder):
             console.print(f"{surface.name}: neural surface taken from the cache")
-            return load_surface(folder)
+            # equal in Ω, but perhaps of another file, with its own units, place and vertex numbers
+            return replace(load_surface(folder), surface=surface)
         return run_overfit(overfit, folder, surface, resuming=(folder / CHECKPOINT_FILE).exists())
 
 

@@ -22,7 +22,7 @@ FORMAT = "nsm-surface"
 VERSION = 1
 STEM = "surface"
 _MOST_VERTICES = 200_000_000  # of a mesh file
-_ARRAYS = ("vertices", "faces", "uv", "source_vertex", "twins", "center")
+_ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "twins", "center")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +131,9 @@ def load_surface(folder: str | Path) -> NeuralSurface:
     tensors, words = read_pair(path / STEM, FORMAT, VERSION)
     try:
         about = words["surface"]
+        if "surface.cut_vertex" not in tensors:  # of a run that knew no merged vertices
+            source = tensors["surface.source_vertex"].numpy()
+            tensors["surface.cut_vertex"] = torch.from_numpy(_first_copies(source))
         arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in _ARRAYS}
         surface = Surface(
             name=str(about["name"]),
@@ -161,6 +164,16 @@ def _network(config: dict[str, Any], state: dict[str, Tensor]) -> nn.Module:
     return network_of(build_map, config, state)
 
 
+def _first_copies(source_vertex: np.ndarray) -> np.ndarray:
+    """``cut_vertex`` (W,) of a surface whose ``source_vertex`` (V,) tells all that is known."""
+    if not 0 <= source_vertex.max() < _MOST_VERTICES:  # rows are made for each of them
+        raise ValueError("a vertex that no mesh file has")
+    known = np.flatnonzero(source_vertex >= 0)[::-1]
+    first = np.full(int(source_vertex.max()) + 1, -1, dtype=np.int64)
+    first[source_vertex[known]] = known
+    return first
+
+
 def _check_shapes(surface: Surface) -> None:
     """ValueError for arrays that are no surface: later work would fail far from the cause."""
     count = len(surface.vertices)
@@ -169,13 +182,16 @@ def _check_shapes(surface: Surface) -> None:
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
     for name in _ARRAYS:
-        whole = name in ("faces", "source_vertex", "twins")
+        whole = name in ("faces", "source_vertex", "cut_vertex", "twins")
         if getattr(surface, name).dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} is not of its type")
     if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
         raise ValueError("no faces, or a vertex of the file below -1")
-    if not 0 <= surface.source_vertex.max() < _MOST_VERTICES:  # rows are made for each of them
-        raise ValueError("a vertex that no mesh file has")
+    cut = surface.cut_vertex
+    if cut.ndim != 1 or not surface.source_vertex.max() < len(cut):
+        raise ValueError("a vertex that the mesh file does not have")
+    if cut.min() < -1 or not 0 <= cut.max() < count:
+        raise ValueError("a vertex of the file that became none of these")
     for name, columns in (("faces", 3), ("twins", 2)):
         index = getattr(surface, name)
         if index.ndim != 2 or index.shape[1] != columns:

@@ -93,7 +93,7 @@ class SurfaceMap:
         """The map with its flipped triangles turned back, and its boundary put in order, where
         that can be done; landmarks stay if that suffices. Figures are to be measured anew."""
         s = self.source.surface
-        held = np.isin(s.source_vertex, self.landmarks[:, 0])
+        held = np.isin(s.source_vertex, s.kept(self.landmarks[:, 0].tolist()))
         better = mended(s, self.image_uv, held=held, onto=True)
         result = replace(
             self, correction=Correction.between(self.image_uv, better, self.correction)
@@ -131,7 +131,7 @@ class SurfaceMap:
             (W, ...) a row for each vertex of the other mesh file (see :func:`by_file_vertex`).
 
         Raises:
-            NsmError: too few rows for the mesh, or other values than finite numbers.
+            NsmError: not a row for each vertex, or other values than finite numbers.
         """
         start, end = self.source.surface, self.target.surface
         places = self._back
@@ -223,12 +223,10 @@ def rotated_planar(config: dict[str, Any]) -> Rotated:
 def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
     """Values at the cut mesh's vertices (V, ...) as values at the mesh file's (W, ...).
 
-    Of a seam vertex the first copy counts; a vertex of the file that is not on the surface (merged
-    or unreferenced) has the value of the one with the nearest number that is.
+    Of a seam vertex the first copy counts, of a merged one what it was merged with; a vertex of
+    the file that is not on the surface has the value of the one with the nearest number that is.
     """
-    known = np.flatnonzero(surface.source_vertex >= 0)[::-1]
-    row = np.full(int(surface.source_vertex.max()) + 1, -1)
-    row[surface.source_vertex[known]] = known
+    row = surface.cut_vertex
     present = np.flatnonzero(row >= 0)
     nearest = present[np.searchsorted(present, np.arange(len(row))).clip(max=len(present) - 1)]
     return values[row[nearest]]
@@ -240,10 +238,10 @@ def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
     Vertices that were inserted between others get what these have: the mean, or a label.
 
     Raises:
-        NsmError: too few rows for the mesh.
+        NsmError: not a row for each vertex of the file.
     """
-    needed = int(surface.source_vertex.max()) + 1
-    if values.ndim == 0 or len(values) < needed:
+    needed = len(surface.cut_vertex)
+    if values.ndim == 0 or len(values) != needed:
         rows = 0 if values.ndim == 0 else len(values)
         raise NsmError(f"{surface.name} has {needed} vertices, but {rows} rows were given")
     result = values[np.maximum(surface.source_vertex, 0)]

@@ -22,7 +22,7 @@ from nsm.surfaces.flat import boundary_self_intersections, flipped_triangles
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.parameterization import METHODS, parameterize
-from nsm.surfaces.validation import clean
+from nsm.surfaces.validation import CleanMesh, clean
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,8 @@ class Surface:
         uv: (V, 2) float64 in Ω, without flipped triangles.
         domain: ``disc`` (unit disc) or ``square`` ([-1, 1]²).
         source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
+        cut_vertex: (W,) int64, of each vertex of the mesh file the first vertex here that it, or
+            the one that it was merged with, became; or -1 if it is not on the surface.
         twins: (T, 2) int64, pairs of vertices on the seam that were one point.
         scale, center: ``vertices = (original - center) * scale``.
         quality: figures of the preparation (see :meth:`from_arrays`).
@@ -48,6 +50,7 @@ class Surface:
     uv: np.ndarray
     domain: str
     source_vertex: np.ndarray
+    cut_vertex: np.ndarray
     twins: np.ndarray
     scale: float
     center: np.ndarray
@@ -159,15 +162,13 @@ class Surface:
             seam = [int(mesh.merged[v]) for v in seam]
         cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
         words = (*log, *mesh.log)
-        return cls.from_cut(
-            cut, mesh.source_vertex, name=name, domain=domain, parameterization=method, log=words
-        )
+        return cls.from_cut(cut, mesh, name=name, domain=domain, parameterization=method, log=words)
 
     @classmethod
     def from_cut(
         cls,
         cut: Cut,
-        source_vertex: np.ndarray,
+        mesh: CleanMesh,
         *,
         name: str = "mesh",
         domain: str = "disc",
@@ -179,7 +180,7 @@ class Surface:
 
         Args:
             cut: the disc, with the vertices of the whole mesh that its own came from.
-            source_vertex: (W,) the mesh file's vertex of each of these.
+            mesh: the whole mesh.
             keys: boundary vertices held at given places of ∂Ω.
             name, domain, parameterization, log: as for :meth:`from_arrays`.
 
@@ -202,7 +203,10 @@ class Surface:
                 f"{name}: the parameterisation is not injective ({flipped} flipped triangles, "
                 f"{crossings} boundary crossings); give seam_vertices at the tips of long parts"
             )
-        source = np.where(cut.origin >= 0, source_vertex[cut.origin], -1)
+        source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
+        known = np.flatnonzero(cut.origin >= 0)[::-1]
+        first = np.full(len(mesh.vertices), -1, dtype=np.int64)
+        first[cut.origin[known]] = known  # the first copy wins
         quality = {
             "flipped_triangles": float(flipped),
             "boundary_self_intersections": float(crossings),
@@ -218,6 +222,7 @@ class Surface:
             uv=flat.uv,
             domain=domain,
             source_vertex=source,
+            cut_vertex=np.where(mesh.merged >= 0, first[mesh.merged], -1),
             twins=cut.twins,
             scale=scale,
             center=center,
@@ -233,6 +238,7 @@ class Surface:
             "faces": self.faces,
             "uv": self.uv,
             "source_vertex": self.source_vertex,
+            "cut_vertex": self.cut_vertex,
             "twins": self.twins,
             "center": self.center,
             "words": np.frombuffer(words.encode(), dtype=np.uint8),
@@ -249,6 +255,7 @@ class Surface:
             uv=stored["uv"],
             domain=domain,
             source_vertex=stored["source_vertex"],
+            cut_vertex=stored["cut_vertex"],
             twins=stored["twins"],
             scale=words["scale"],
             center=stored["center"],
@@ -275,17 +282,26 @@ class Surface:
         Raises:
             NsmError: a vertex that the file does not have, or that was removed as bad.
         """
+        return self.uv[self._found(vertex_ids)]
+
+    def kept(self, vertex_ids: Sequence[int]) -> np.ndarray:
+        """Vertices (L,) of the mesh file as ``source_vertex`` has them: merged ones by the vertex
+        that they were merged with.
+
+        Raises:
+            NsmError: as :meth:`preimages`.
+        """
+        return self.source_vertex[self._found(vertex_ids)]
+
+    def _found(self, vertex_ids: Sequence[int]) -> np.ndarray:
         numbers = _numbers(vertex_ids, f"{self.name}: vertices")
-        result = np.empty((len(numbers), 2))
-        for row, vertex in enumerate(numbers):
-            found = np.flatnonzero(self.source_vertex == vertex)
-            if vertex < 0 or len(found) == 0:
+        for vertex in numbers:
+            if not 0 <= vertex < len(self.cut_vertex) or self.cut_vertex[vertex] < 0:
                 raise NsmError(
                     f"{self.name}: vertex {vertex} is not on the surface "
-                    f"(0 to {int(self.source_vertex.max())}); give another landmark"
+                    f"(0 to {len(self.cut_vertex) - 1}); give another landmark"
                 )
-            result[row] = self.uv[found[0]]
-        return result
+        return self.cut_vertex[np.array(numbers, dtype=np.int64)]
 
 
 def as_it_lies(
@@ -304,6 +320,7 @@ def as_it_lies(
         uv=uv,
         domain=domain,
         source_vertex=np.arange(len(uv)),
+        cut_vertex=np.arange(len(uv)),
         twins=np.zeros((0, 2), dtype=np.int64) if twins is None else twins,
         scale=1.0,
         center=np.zeros(3),

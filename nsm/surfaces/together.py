@@ -100,7 +100,8 @@ def prepare_together(
         "method": parameterization,
         "seam": [seam, seam_landmarks],
     }
-    names = [cache_.preparation_key(c.vertices, c.faces, options) for c in cleaned]
+    # of the files as they are: cleaned alike, they may still have other vertex numbers
+    names = [cache_.preparation_key(m.vertices, m.faces, options) for m in meshes]
     if cache:
         stored = [cache_.read(key) for key in names]
         if all(s is not None for s in stored):
@@ -172,7 +173,7 @@ def _cut_alike(
     return [
         Surface.from_cut(
             cut,
-            c.source_vertex,
+            c,
             name=m.name,
             domain=domain,
             parameterization=method,
@@ -342,7 +343,7 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
         NsmError: a landmark that a surface does not have, or boundaries that do not correspond.
     """
     keys = [
-        boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], ids)
+        boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], s.kept(ids.tolist()))
         for s, ids in zip(surfaces, landmarks, strict=True)
     ]
     alike = turned_alike(keys)

@@ -126,6 +126,31 @@ def test_values_are_carried_over_and_back(made, files):
         f.transfer(colours[:10])
 
 
+def test_a_file_with_copies_of_vertices_in_other_units(made, files, tmp_path):
+    _, f = made
+    egg = trimesh.load(files / "egg.obj", process=False)
+    ball = np.asarray(trimesh.load(files / "ball.obj", process=False).vertices)
+    n = len(egg.vertices)
+    copied = egg.faces + n * (np.arange(len(egg.faces)) % 2)[:, None]
+    points = 2 * np.concatenate([egg.vertices, egg.vertices, [[0, 0, 0]]])  # the last in no face
+    trimesh.Trimesh(points, copied, process=False).export(tmp_path / "egg in cm.obj")
+    pairs = [(i, j + n * (j % 2)) for i, j in f.landmarks.tolist()]
+    settings = [*QUICK, MADE, SEAM, "trainer.max_steps=200"]
+    place = [files / "ball.obj", tmp_path / "egg in cm.obj"]
+    g = nsm.map_pair(*place, pairs, overrides=settings, progress=False)
+    assert g.target.surface.name == "egg in cm"
+    assert np.allclose(g(ball), 2 * f(ball))
+    there, expected = g.transfer(ball), f.transfer(ball)
+    assert there.shape == (len(points), 3)
+    assert np.allclose(there[:n], expected) and np.allclose(there[n:-1], expected)
+    assert np.allclose(g.transfer(there, back=True), f.transfer(expected, back=True))
+    for wrong in (there[:-1], np.concatenate([there, there])):
+        with pytest.raises(NsmError, match="rows"):
+            g.transfer(wrong, back=True)
+    g.save(tmp_path / "saved")
+    assert np.array_equal(nsm.load(tmp_path / "saved").transfer(ball), there)
+
+
 def test_a_morph_begins_at_the_source_and_ends_at_the_image(made):
     _, f = made
     assert (f.morph(0.0) == f.source.surface.vertices).all()

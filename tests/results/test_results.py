@@ -115,7 +115,7 @@ def test_saved_and_loaded_is_the_same(neural, tmp_path):
     again = load_surface(tmp_path)
     uv = torch.rand(10, 2)
     assert torch.equal(neural.map(uv), again.map(uv))
-    for name in ("vertices", "faces", "uv", "twins", "source_vertex", "center"):
+    for name in ("vertices", "faces", "uv", "twins", "source_vertex", "cut_vertex", "center"):
         assert np.array_equal(getattr(neural.surface, name), getattr(again.surface, name))
     assert again.metrics == neural.metrics
     assert again.config == neural.config

@@ -115,6 +115,11 @@ def test_prepared_surfaces_are_taken_from_the_cache(pair):
     assert (first[1].uv == second[1].uv).all()
     other = prepare_together(meshes, [i[::-1] for i in ids], seam="shortest")
     assert "prepared surface taken from the cache" not in other[1].log
+    # cleaned, this mesh is the same, but its vertices have other numbers
+    first, second = meshes
+    shifted = Mesh("egg", np.concatenate([[[9, 9, 9]], second.vertices]), second.faces + 1)
+    more = prepare_together([first, shifted], [ids[0], ids[1] + 1], seam="shortest")
+    assert more[1].source_vertex.max() == len(second.vertices)
 
 
 def test_open_meshes_are_left_whole():

@@ -285,7 +285,7 @@ def _file_shape(
 ) -> Shape:
     s = neural.surface
     ids = () if landmarks is None else landmarks
-    rows = [int(np.flatnonzero(s.source_vertex == vertex)[0]) for vertex in ids]
+    rows = [int(s.cut_vertex[vertex]) for vertex in ids]
     own = neural.in_original_units(vertices)
     return Shape(name, shown, s.faces, s.uv, own, s.twins, np.array(rows, dtype=np.int64))
 
