@@ -23,11 +23,7 @@ _ROWS = {
 
 def metrics_table(metrics: Mapping[str, float]) -> Table:
     """The figures of :func:`nsm.results.overfit_metrics` with their names and units."""
-    table = Table("figure", "value", "unit")
-    table.columns[1].justify = "right"
-    for key, (label, unit) in _ROWS.items():
-        table.add_row(label, f"{metrics[key]:.3f}", unit)
-    return table
+    return _figures(metrics, _ROWS)
 
 
 _MAP_COLUMNS = {
@@ -66,11 +62,7 @@ _PAIR_ROWS = {
 
 def pair_table(metrics: Mapping[str, float]) -> Table:
     """The main figures of :func:`nsm.results.pair_metrics` with their names and units."""
-    table = Table("figure", "value", "unit")
-    table.columns[1].justify = "right"
-    for key, (label, unit) in _PAIR_ROWS.items():
-        table.add_row(label, f"{metrics[key]:.3f}", unit)
-    return table
+    return _figures(metrics, _PAIR_ROWS)
 
 
 _COLLECTION_COLUMNS = {
@@ -108,3 +100,11 @@ FIGURES: dict[str, tuple[str, str]] = {
     "steps": ("steps", ""),
     "seconds": ("time", "s"),
 }
+
+
+def _figures(metrics: Mapping[str, float], rows: Mapping[str, tuple[str, str]]) -> Table:
+    table = Table("figure", "value", "unit")
+    table.columns[1].justify = "right"
+    for key, (label, unit) in rows.items():
+        table.add_row(label, f"{metrics[key]:.3f}", unit)
+    return table
