@@ -5,10 +5,12 @@ from __future__ import annotations
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nsm.surfaces import Surface
+from nsm.surfaces.topology import edges_of
 
 
 class Samples(NamedTuple):
@@ -59,16 +61,37 @@ class SurfaceSampler:
         """``count`` points, uniform by area of the mesh."""
         return self._at(*self._places(count, generator))
 
-    def by_area_with_jacobian(
-        self, count: int, generator: torch.Generator
+    def with_jacobian(
+        self, count: int, boundary_every: int, generator: torch.Generator
     ) -> tuple[Samples, Tensor]:
-        """``count`` points, uniform by area, and the Jacobian (N, 3, 2) of f: Ω → mesh there."""
+        """``count`` points, and the Jacobian (N, 3, 2) of f: Ω → mesh there.
+
+        The first of every ``boundary_every`` points is on the mesh's boundary, uniform by length;
+        the others are uniform by area.
+        """
         face, weights = self._places(count, generator)
+        on = slice(None, None, boundary_every)
+        face[on], weights[on] = self._boundary_places(len(face[on]), generator)
         plane, space = self.uv[self.faces[face]].double(), self.vertices[self.faces[face]].double()
         sides = torch.stack([plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0]], dim=2)
         edges = torch.stack([space[:, 1] - space[:, 0], space[:, 2] - space[:, 0]], dim=2)
         jacobian = torch.linalg.solve_ex(sides, edges, left=False).result
         return self._at(face, weights), jacobian.to(self.vertices.dtype)
+
+    def _boundary_places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Faces (N,) and barycentric weights (N, 3) of points uniform by length on the boundary."""
+        edges = edges_of(self.faces.cpu().numpy())
+        faces, corners = torch.as_tensor(
+            np.stack(np.nonzero(edges.count[edges.of_corner] == 1)), device=self.device
+        )
+        ends = [self.vertices[self.faces[faces, (corners + k) % 3]] for k in range(2)]
+        dice = torch.rand(2, count, generator=generator, device=self.device, dtype=torch.float64)
+        side = torch.searchsorted(_cumulative((ends[1] - ends[0]).norm(dim=1)), dice[0])
+        side, along = side.clamp(max=len(faces) - 1), dice[1].to(self.vertices.dtype)
+        weights = torch.zeros(count, 3, device=self.device)
+        row, corner = torch.arange(count, device=self.device), corners[side]
+        weights[row, corner], weights[row, (corner + 1) % 3] = 1 - along, along
+        return faces[side], weights
 
     def _places(
         self, count: int, generator: torch.Generator, cumulative: Tensor | None = None
@@ -127,7 +150,7 @@ class SurfaceSampler:
 
 
 def _cumulative(areas: Tensor) -> Tensor:
-    """Of the faces up to each: share of the whole area."""
+    """Of the faces (or sides) up to each: share of the whole area (or length)."""
     # summed in float64: with a million faces a float32 sum would lose the small ones
     cumulative = areas.double().cumsum(0)
     return cumulative / cumulative[-1]

@@ -85,6 +85,24 @@ def test_uv_and_points_correspond(uneven):
         assert found
 
 
+def test_one_of_so_many_samples_is_on_the_boundary_by_length(uneven):
+    sampler = SurfaceSampler(uneven)
+    samples, jacobian = sampler.with_jacobian(60_000, 3, sampler.generator(4))
+    half = sampler.vertices.amax(dim=0)[:2]  # the rectangle is twice as long as it is high
+    at_side = (samples.points[:, :2].abs() - half).abs() < 1e-6  # at x = ±half, at y = ±half
+    on_rim = at_side.any(dim=1)
+    assert on_rim[::3].all() and on_rim.float().mean() == pytest.approx(1 / 3, abs=1e-3)
+    assert at_side[::3, 1].float().mean() == pytest.approx(2 / 3, abs=0.01)
+    left = samples.points[::3][at_side[::3, 1], 0] < 0
+    assert left.float().mean() == pytest.approx(0.5, abs=0.01)
+    # the map from Ω is affine on each triangle: from the boundary too it leads to the corners
+    for k in (0, 3, 300, 301):
+        ways = torch.as_tensor(uneven.uv, dtype=torch.float32) - samples.uv[k]
+        reached = samples.points[k] + ways @ jacobian[k].t()
+        met = (reached - sampler.vertices).norm(dim=1) < 1e-4
+        assert any(met[list(face)].all() for face in uneven.faces)
+
+
 def test_a_batch_depends_on_seed_and_step_alone(uneven):
     first, again = (OverfitData(uneven, batch_size=64, seed=3) for _ in range(2))
     first.setup()

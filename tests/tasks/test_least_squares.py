@@ -79,6 +79,23 @@ def test_a_curved_surface_is_met_before_any_training():
     assert fitted["normal_error_mean_degrees"] < 1
 
 
+def test_the_boundary_is_met_the_better_for_samples_on_it(monkeypatch):
+    """There both sides of a seam have to meet. The waves are too short for the grid."""
+    rough = sheet(lambda u, v: 0.1 * np.sin(9 * u) * np.sin(9 * v))
+    on_boundary = np.abs(rough.uv).max(axis=1) == 1
+    uv = torch.as_tensor(rough.uv[on_boundary], dtype=torch.float32)
+    wanted = torch.as_tensor(rough.vertices[on_boundary], dtype=torch.float32)
+    errors = []
+    for every in (33, 10**9):
+        monkeypatch.setattr("nsm.tasks.least_squares._BOUNDARY_EVERY", every)
+        encoding = {**GRID, "resolutions": [8]}
+        network = build_map({"width": 8, "depth": 1, "encoding": encoding, "readout": "fitted"})
+        fit_readout(network, rough)
+        with torch.no_grad():
+            errors.append(float((network(uv) - wanted).square().sum(dim=1).mean().sqrt()))
+    assert errors[0] < 0.95 * errors[1]
+
+
 def test_too_few_features_are_told():
     config = compose_config(["map.readout=fitted", "encoding.features=2", "domain=square"])
     with pytest.raises(NsmError, match="needs 3 features"):
