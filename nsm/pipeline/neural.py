@@ -24,6 +24,9 @@ from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.several import Parted
 
+# of how neural surfaces are made: to be raised when the same settings come to make others
+_VERSION = 2
+
 # settings that do not change what a neural surface becomes
 _INCIDENTAL = (
     "surface",
@@ -141,7 +144,7 @@ def _place_of(surface: Surface, overfit: DictConfig) -> Path:
     settings = {k: v for k, v in plain(overfit).items() if k not in _INCIDENTAL}
     for key in ("progress", "compile", "devices"):
         settings["trainer"].pop(key)
-    text = surface.content_key() + json.dumps(settings, sort_keys=True)
+    text = f"{_VERSION} {surface.content_key()}{json.dumps(settings, sort_keys=True)}"
     folder = cache_folder() / "neural" / hashlib.sha256(text.encode()).hexdigest()[:32]
     folder.parent.mkdir(parents=True, exist_ok=True)
     return folder
