@@ -1,18 +1,23 @@
 """The documentation builds without warnings, and what it is made of is all there."""
 
 import os
+import re
+import shlex
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import nsm
 from nsm.config import conf_folder
+from nsm.maps import build_analytic
 from nsm.reference import groups
 
 ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 class Page(HTMLParser):
@@ -66,3 +71,21 @@ def test_settings_are_those_of_the_configuration(site):
 
 def test_everything_public_is_in_the_reference(site):
     assert {f"nsm.{name}" for name in nsm.__all__} <= Page(site / "api.html").ids
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_words_of_commands_can_be_read(page):
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    commands = re.findall(r"^(?:\$ )?nsm ([^|\n]*)", text, re.MULTILINE)
+    inline = re.findall(r"`(?:nsm )?([\w.+]+=[^`|\n]+)`", text)
+    lines = [shlex.split(line, comments=True) for line in [*commands, *inline]]
+    words = [
+        word
+        for line in lines
+        if line[0] not in ("report", "view") and not {"...", "-sc"} & set(line)
+        for word in line
+        if not word.startswith("-") and "=" in word
+    ]
+    for read in OverridesParser.create().parse_overrides(words):
+        if read.get_key_element() == "target" and isinstance(read.value(), dict):
+            build_analytic(read.value())
