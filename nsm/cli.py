@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -33,6 +34,8 @@ def _run(config: DictConfig) -> bool:
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
         typed = checked(config)
+        if typed.resume is not None:
+            _check_alone(str(typed.resume), HydraConfig.get().overrides.task)
         from nsm.pipeline import run
 
         run(typed, folder)
@@ -50,6 +53,16 @@ def _run(config: DictConfig) -> bool:
         if folder != here:  # folders around it that are not within are not Hydra's, and stay
             remove_empty([folder, *(place for place in folder.parents if here in place.parents)])
     return True
+
+
+def _check_alone(resume: str, words: Sequence[str]) -> None:
+    """NsmError for settings beside ``resume``: they would do nothing."""
+    others = [word for word in words if not word.startswith("resume=")]
+    if others:
+        raise NsmError(
+            f"resume={resume}: a run goes on with the settings in its config.yaml; leave out "
+            f"{' '.join(others)}"
+        )
 
 
 def main() -> None:

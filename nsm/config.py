@@ -329,9 +329,22 @@ def one_line(error: BaseException, overrides: Sequence[str] = ()) -> str:
     text = str(error).strip()
     first = text.splitlines()[0] if text else type(error).__name__
     if isinstance(error, OverrideParseException):
+        if "=" not in str(error.override):
+            from nsm.surfaces.loading import EXTENSIONS
+
+            mesh = Path(str(error.override)).suffix.lower() in EXTENSIONS
+            hint = f"surface.path={error.override}" if mesh else "SETTING=VALUE; see nsm --help"
+            return f"{error.override}: no setting, and no command of nsm; give {hint}"
         return (
-            f"{error.override}: {first}; quote values with signs in them, as in "
+            f"{error.override}: cannot be read; quote values with signs in them, as in "
             "'surface.path=\"a=b.obj\"'"
+        )
+    several = re.search(r"Ambiguous value for argument '([^'=]+)=(.*)'$", first)
+    if several:
+        key, values = several.groups()
+        return (
+            f"{key}={values}: several values; nsm -m runs each, {key}=[{values}] is a list, "
+            f"'{key}=\"{values}\"' one value with commas"
         )
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:

@@ -252,6 +252,11 @@ def test_bad_input_in_a_process_of_its_own(tmp_path):
         (["surface=hemisphere", "surface.seam_vertices=[0,99999]"], "99999"),
         (["surface=hemisphere", "trainer.accelerator=tpuu"], "accelerator"),
         (["resume=nowhere"], "nowhere"),
+        (["resume=nowhere", "trainer.max_steps=9"], "leave out trainer.max_steps=9"),
+        (["mine.obj"], "give surface.path=mine.obj"),
+        (["version"], "nsm --help"),
+        (["surface=hemisphere", "seed=0,1"], "nsm -m"),
+        (["surface.path=a, (b).obj"], "quote"),
     ],
 )
 def test_a_bad_setting_is_one_line_and_status_2(tmp_path, here, words, expected):
