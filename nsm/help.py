@@ -16,13 +16,13 @@ _USAGE = """\
 Neural surface maps: meshes as networks, and maps between them.
 
   nsm [GROUP=OPTION ...] [SETTING=VALUE ...]     run
-  nsm -m GROUP=OPTION,OPTION ...                 run all combinations, as a sweep
+  nsm -m GROUP=OPTION,OPTION ...                 run all combinations: a sweep
   nsm -m sweep=NAME ...                          a sweep that is ready
   nsm resume=FOLDER                              go on with an interrupted run
   nsm report FOLDER...                           compare runs in one page
-  nsm view FOLDER                                turn and click a run's shapes in the browser
-  nsm --help GROUP                               the settings of a group, with remarks
-  nsm --cfg job [...]                            the settings that a run would have"""
+  nsm view FOLDER                                a run's shapes in the browser
+  nsm --help GROUP                               the settings of a group
+  nsm --cfg job [...]                            the settings, and no run"""
 
 _CLOSING = """\
 Any setting can be replaced: trainer.max_steps=500, energy.lambda_normal=0.1; one that the chosen

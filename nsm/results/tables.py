@@ -38,8 +38,10 @@ _MAP_COLUMNS = {
 
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
     """The figures of :func:`nsm.results.planar_metrics`, a row for each map."""
-    table = Table("map", *_MAP_COLUMNS.values())
+    table = Table("map", padding=(0, 1, 0, 0))  # headings are whole in a terminal of 80 columns
     table.columns[0].no_wrap = True
+    for heading in _MAP_COLUMNS.values():
+        table.add_column(heading, width=max(map(len, heading.split())))
     for name, figures in metrics.items():
         table.add_row(name, *(f"{figures[key]:.3f}" for key in _MAP_COLUMNS))
     return table
