@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from omegaconf import DictConfig
 
 from nsm.config import compose_config
 from nsm.errors import NsmError, of_disk
+from nsm.folders import passing_folder
 from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
 from nsm.pipeline.alone import alone
 from nsm.results import (
@@ -53,7 +53,7 @@ def overfit(
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
     _expect(surface, Surface)
-    words = ["task=overfit", *overrides, f"domain={surface.domain}"]
+    words = ["task=overfit", *_listed(overrides), f"domain={surface.domain}"]
     with _place(folder, words, progress) as (config, place):
         return run_overfit(config, place, surface)
 
@@ -85,7 +85,7 @@ def parameterize(
         >>> flat.uv  # (V, 2), of the cut mesh's vertices
     """
     _expect(phi, NeuralSurface)
-    words = ["task=param", *overrides, f"domain={phi.surface.domain}"]
+    words = ["task=param", *_listed(overrides), f"domain={phi.surface.domain}"]
     with _place(folder, words, progress) as (config, place):
         return run_param(config, place, phi)
 
@@ -123,7 +123,7 @@ def map_pair(
         >>> f = nsm.map_pair("cat.obj", "horse.obj", landmarks=[(5259, 2289), (3651, 5255)])
         >>> f(points)  # (N, 3) on the cat to (N, 3) on the horse
     """
-    words = ["task=pair_map", *overrides]
+    words = ["task=pair_map", *_listed(overrides)]
     ready = [end for end in (source, target) if isinstance(end, NeuralSurface)]
     if ready:
         words.append(f"domain={ready[0].surface.domain}")
@@ -158,12 +158,18 @@ def map_collection(
     """
     if not isinstance(surfaces, Sequence):
         raise NsmError("surfaces: give a list of them")
-    words = ["task=collection_map", *overrides]
+    words = ["task=collection_map", *_listed(overrides)]
     ready = [surface for surface in surfaces if isinstance(surface, NeuralSurface)]
     if ready:
         words.append(f"domain={ready[0].surface.domain}")
     with _place(folder, words, progress) as (config, place):
         return run_collection_map(config, place, surfaces, landmarks)
+
+
+def _listed(overrides: Sequence[str]) -> Sequence[str]:
+    if isinstance(overrides, str) or not all(isinstance(word, str) for word in overrides):
+        raise NsmError('overrides: give a list of settings, as in ["trainer.max_steps=1000"]')
+    return overrides
 
 
 def _expect(given: Any, kind: type) -> None:
@@ -184,7 +190,7 @@ def _place(
             with alone(Path(folder)):
                 yield config, Path(folder)
             return
-        with tempfile.TemporaryDirectory(prefix="nsm-") as temporary:
+        with passing_folder() as temporary:
             yield compose_config([*words, "logger=none", "artefacts=false"]), Path(temporary)
     except OSError as error:
         raise NsmError(f"{of_disk(error)}; give another folder, or make room") from error
@@ -204,6 +210,8 @@ def load(
     Raises:
         NsmError: nothing there, or a file that is damaged or of another version.
     """
+    if not Path(folder).exists():
+        raise NsmError(f"{folder}: no such folder; give the folder of a run")
     if (Path(folder) / "collection.json").exists():
         return load_collection(folder)
     if (Path(folder) / "pair.json").exists():

@@ -283,6 +283,16 @@ def test_a_safetensors_header_that_lies(copy):
             nsm.load(copy)
 
 
+def test_mistaken_arguments_in_python(tmp_path):
+    hemisphere = nsm.Surface.load("hemisphere")
+    with pytest.raises(NsmError, match="give a list of settings"):
+        nsm.overfit(hemisphere, overrides="experiment=quick")
+    with pytest.raises(NsmError, match=r"Surface\.from_arrays"):
+        nsm.Surface.load(hemisphere)
+    with pytest.raises(NsmError, match="no such folder"):
+        nsm.load(tmp_path / "outputs")
+
+
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "mesh.obj")
     with pytest.raises(NsmError, match="not a regular file"):

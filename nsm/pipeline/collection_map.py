@@ -15,7 +15,7 @@ from rich.console import Console
 
 from nsm.data import CollectionData
 from nsm.errors import NsmError
-from nsm.pipeline.common import built, fitted, frozen, plain, with_map, write_figures
+from nsm.pipeline.common import built, fitted, frozen, plain, say_where, with_map, write_figures
 from nsm.pipeline.guarantee import guaranteed
 from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.pipeline.pair_map import absolute_paths
@@ -116,7 +116,7 @@ def run_collection_map(
     }
     write_figures(config, folder, first, trainer, started, figures)
     console.print(collection_table(result.metrics))
-    console.print(f"results in {folder}", soft_wrap=True)
+    say_where(console, folder)
     return result
 
 

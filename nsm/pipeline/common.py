@@ -24,6 +24,7 @@ from torch.multiprocessing.spawn import ProcessRaisedException
 from nsm.config import PRECISIONS, checked, read_config
 from nsm.data import OverfitData
 from nsm.errors import NsmError
+from nsm.folders import is_passing
 from nsm.pipeline.processes import Process, shared_steps, take_over, told_by
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
@@ -33,6 +34,7 @@ from nsm.results.loggers import Distributed, build_loggers, close, log_figures, 
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
 from nsm.surfaces import Surface
+from nsm.surfaces.cache import cache_folder
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.several import Several
 
@@ -119,6 +121,12 @@ def report_surface(console: Console, surface: Surface) -> None:
     )
     for line in surface.log:
         console.print(f"  {line}", soft_wrap=True)
+
+
+def say_where(console: Console, folder: Path) -> None:
+    """Print where a run's results are, if they stay there."""
+    if not is_passing(folder):
+        console.print(f"results in {folder}", soft_wrap=True)
 
 
 def train(
@@ -304,8 +312,10 @@ def trained(
         if trainer.state.status != "finished":
             close(trainer.loggers, "failed")
     if trainer.interrupted:
-        how = f"go on with: nsm resume={folder}" if len(runs) == 1 else "the same command goes on"
-        console.print(f"interrupted; {how}", soft_wrap=True)
+        how = f"; go on with: nsm resume={folder}"
+        if len(runs) > 1 or cache_folder() in folder.parents:  # of a sweep, or for a map
+            how = "; the same command goes on"
+        console.print(f"interrupted{'' if is_passing(folder) else how}", soft_wrap=True)
         raise KeyboardInterrupt
     if several:
         take_over(trainer, data, folder / CHECKPOINT_FILE)

@@ -21,6 +21,7 @@ from nsm.pipeline.common import (
     frozen,
     plain,
     report_surface,
+    say_where,
     train,
     trained,
     with_map,
@@ -105,7 +106,7 @@ def leave_results(
         figures["together"] = len(trainer.lightning_module.each)
     write_figures(config, folder, surface, trainer, started, figures, index)
     console.print(metrics_table(neural.metrics))
-    console.print(f"results in {folder}", soft_wrap=True)
+    say_where(console, folder)
     return neural
 
 

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.common import built, frozen, plain, train, with_map, write_figures
+from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
 from nsm.pipeline.guarantee import guaranteed
 from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape, vertex_count
 from nsm.results import (
@@ -119,7 +119,7 @@ def run_pair_map(
         },
     )
     console.print(pair_table(result.metrics))
-    console.print(f"results in {folder}", soft_wrap=True)
+    say_where(console, folder)
     return result
 
 

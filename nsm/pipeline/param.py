@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.pipeline.common import built, frozen, plain, train, with_map, write_figures
+from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
 from nsm.pipeline.guarantee import guaranteed
 from nsm.pipeline.neural import neural_surface
 from nsm.results import (
@@ -89,7 +89,7 @@ def run_param(
         console.print(
             "nothing is flipped, but the image overlaps itself; constraints.boundary=fixed forbids"
         )
-    console.print(f"results in {folder}", soft_wrap=True)
+    say_where(console, folder)
     return result
 
 

@@ -37,9 +37,9 @@ class NeuralSurface:
     """
 
     surface: Surface
-    map: nn.Module
-    metrics: dict[str, float] = field(default_factory=dict)
-    config: dict[str, Any] = field(default_factory=dict)
+    map: nn.Module = field(repr=False)
+    metrics: dict[str, float] = field(default_factory=dict, repr=False)
+    config: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @overload
     def __call__(self, uv: np.ndarray) -> np.ndarray: ...

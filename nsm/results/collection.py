@@ -45,11 +45,11 @@ class SurfaceCollection:
     """
 
     surfaces: list[NeuralSurface]
-    maps: list[nn.Module]
-    landmarks: np.ndarray
-    metrics: dict[str, Any] = field(default_factory=dict)
-    config: dict[str, Any] = field(default_factory=dict)
-    corrections: dict[tuple[int, int], Correction] = field(default_factory=dict)
+    maps: list[nn.Module] = field(repr=False)
+    landmarks: np.ndarray = field(repr=False)
+    metrics: dict[str, Any] = field(default_factory=dict, repr=False)
+    config: dict[str, Any] = field(default_factory=dict, repr=False)
+    corrections: dict[tuple[int, int], Correction] = field(default_factory=dict, repr=False)
     _made: dict[tuple[int, int], SurfaceMap] = field(default_factory=dict, repr=False)
     _back: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
 

@@ -37,10 +37,10 @@ class Parameterization:
     """
 
     phi: NeuralSurface
-    map: Planar
-    metrics: dict[str, dict[str, float]] = field(default_factory=dict)
-    config: dict[str, Any] = field(default_factory=dict)
-    correction: Correction = field(default_factory=Correction)
+    map: Planar = field(repr=False)
+    metrics: dict[str, dict[str, float]] = field(default_factory=dict, repr=False)
+    config: dict[str, Any] = field(default_factory=dict, repr=False)
+    correction: Correction = field(default_factory=Correction, repr=False)
 
     def __call__(self, uv: np.ndarray) -> np.ndarray:
         """Points (N, 2) of Ω to the plane (N, 2); linear on each triangle of the mesh.

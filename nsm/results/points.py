@@ -29,7 +29,7 @@ def as_values(given: Any, what: str, *, kinds: str = "fiubc") -> np.ndarray:
         NsmError: other things than numbers, NaN or infinity.
     """
     try:
-        values = np.asarray(given)
+        values = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
     except (TypeError, ValueError):  # rows of different lengths
         raise NsmError(f"{what}: not an array of numbers") from None
     if values.dtype.kind not in kinds:

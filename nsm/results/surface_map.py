@@ -48,11 +48,11 @@ class SurfaceMap:
 
     source: NeuralSurface
     target: NeuralSurface
-    map: nn.Module
-    landmarks: np.ndarray
-    metrics: dict[str, float] = field(default_factory=dict)
-    config: dict[str, Any] = field(default_factory=dict)
-    correction: Correction = field(default_factory=Correction)
+    map: nn.Module = field(repr=False)
+    landmarks: np.ndarray = field(repr=False)
+    metrics: dict[str, float] = field(default_factory=dict, repr=False)
+    config: dict[str, Any] = field(default_factory=dict, repr=False)
+    correction: Correction = field(default_factory=Correction, repr=False)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.

@@ -45,17 +45,17 @@ class Surface:
     """
 
     name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
+    vertices: np.ndarray = field(repr=False)
+    faces: np.ndarray = field(repr=False)
+    uv: np.ndarray = field(repr=False)
     domain: str
-    source_vertex: np.ndarray
-    cut_vertex: np.ndarray
-    twins: np.ndarray
-    scale: float
-    center: np.ndarray
-    quality: dict[str, float] = field(default_factory=dict)
-    log: tuple[str, ...] = ()
+    source_vertex: np.ndarray = field(repr=False)
+    cut_vertex: np.ndarray = field(repr=False)
+    twins: np.ndarray = field(repr=False)
+    scale: float = field(repr=False)
+    center: np.ndarray = field(repr=False)
+    quality: dict[str, float] = field(default_factory=dict, repr=False)
+    log: tuple[str, ...] = field(default=(), repr=False)
 
     @classmethod
     def load(
@@ -80,6 +80,11 @@ class Surface:
         Raises:
             NsmError: no such file or name, or a mesh that cannot be prepared.
         """
+        if not isinstance(path_or_name, (str, Path)):
+            kind = type(path_or_name).__name__
+            raise NsmError(
+                f"a {kind} is no mesh file; give its path, or the arrays to Surface.from_arrays"
+            )
         text = str(path_or_name)
         if Path(text).suffix or "/" in text or "\\" in text or Path(text).exists():
             vertices, faces, log = load_mesh(path_or_name)

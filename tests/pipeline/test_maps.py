@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 import nsm
@@ -108,6 +109,17 @@ def test_points_go_to_the_target_in_its_own_units(made, files):
     ids = f.landmarks
     off = np.linalg.norm(f(ball.vertices[ids[:, 0]]) - egg.vertices[ids[:, 1]], axis=1)
     assert off.max() < 0.02
+
+
+def test_points_may_be_tensors_that_a_gradient_is_wanted_of(made):
+    _, f = made
+    points = torch.tensor(f.source.in_original_units(f.source.surface.vertices[:5]))
+    assert np.array_equal(f(points.requires_grad_()), f(points.detach().numpy()))
+
+
+def test_results_are_shown_in_a_line(made, trio):
+    for name, shown in (("ball", repr(made[1])), ("cone", repr(trio))):
+        assert f"name='{name}'" in shown and len(shown) < 500
 
 
 def test_values_are_carried_over_and_back(made, files):
