@@ -123,8 +123,11 @@ class Faults(Callback):
                 f"step {trainer.global_step}: out of memory; batches are evaluated in {parts} parts"
             )
 
-    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """The last update has no step after it that would find it out."""
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """The last update has no step after it that would find it out; the last checkpoint, which
+        is written next, has what it is put right to."""
+        if trainer.global_step < trainer.max_steps and not trainer.should_stop:
+            return
         trained = [p for p in pl_module.parameters() if p.requires_grad]
         if self.good is None or all(bool(torch.isfinite(p).all()) for p in trained):
             return

@@ -119,6 +119,20 @@ def test_a_first_step_that_is_not_finite_has_nothing_to_go_back_to(surface, tmp_
         run(surface, tmp_path)
 
 
+def test_a_last_step_that_is_not_finite_is_not_in_the_checkpoint(surface, tmp_path, monkeypatch):
+    def spoilt(self, *_):
+        if self.global_step == 60:
+            torch.nn.init.constant_(self.map.output.weight, float("nan"))
+
+    monkeypatch.setattr(Overfit, "on_train_batch_end", spoilt)
+    run(surface, tmp_path)
+    before, faults = weights(tmp_path), told(tmp_path)
+    assert faults["rollbacks"] == [{"step": 60, "back_to": 50}]
+    (tmp_path / "metrics.json").unlink()
+    run(surface, tmp_path, resuming=True)
+    assert same(weights(tmp_path), before) and told(tmp_path) == faults
+
+
 def test_a_rolled_back_training_resumes_to_the_same_weights(surface, tmp_path, monkeypatch):
     spoil(monkeypatch, lambda step: step in (25, 41), FAULTS["loss is NaN"])
     run(surface, tmp_path / "whole")
