@@ -26,7 +26,10 @@ SETTINGS = st.fixed_dictionaries(
         "width": st.integers(1, 6),
         "depth": st.integers(0, 3),
         "block": st.sampled_from(sorted(BLOCKS)),
-        "activation": st.sampled_from(sorted(ACTIVATIONS)).map(lambda name: {"name": name}),
+        # at its usual 30, a few layers of sines multiply rounding errors by millions
+        "activation": st.sampled_from(sorted(ACTIVATIONS)).map(
+            lambda name: {"name": name, **({"omega": 3.0} if name == "sine" else {})}
+        ),
         "encoding": st.sampled_from(
             [
                 {"name": "identity"},
