@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -134,16 +135,27 @@ class Schema:
     resume: str | None = None
 
 
-_POSITIVE = (
-    "map.width",
-    "data.batch_size",
-    "data.steps_per_epoch",
-    "data.held_out",
-    "trainer.max_steps",
-    "trainer.devices",
-    "trainer.stop_window",
-    "logger.every",
-)
+# the least that each may be; those that may be null are checked where they are given
+_LEAST = {
+    "map.width": 1,
+    "map.depth": 0,
+    "data.batch_size": 1,
+    "data.steps_per_epoch": 1,
+    "data.pool": 1,
+    "data.held_out": 1,
+    "trainer.max_steps": 1,
+    "trainer.devices": 1,
+    "trainer.threads": 1,
+    "trainer.stop_gradient_norm": 0,
+    "trainer.stop_window": 1,
+    "trainer.gradient_clip": 0,
+    "guarantee.rounds": 0,
+    "logger.every": 1,
+    "logger.pictures": 0,
+    "seed": 0,
+}
+_LARGEST_SEED = 2**32 - 1  # that numpy takes
+_LARGEST_NUMBER = 2**63 - 1  # that whole numbers of 64 bits hold
 
 
 _LARGEST_CONFIG = 1_000_000  # bytes
@@ -229,9 +241,12 @@ def checked(config: DictConfig) -> DictConfig:
     missing = sorted(OmegaConf.missing_keys(typed))
     if missing:
         raise NsmError(f"setting {missing[0]}: missing; choose an option of its group or give it")
-    for key in _POSITIVE:
-        if OmegaConf.select(typed, key) < 1:
-            raise NsmError(f"setting {key}: {OmegaConf.select(typed, key)} is not at least 1")
+    for key, least in _LEAST.items():
+        value = OmegaConf.select(typed, key)
+        if value is not None and value < least:
+            raise NsmError(f"setting {key}: {value} is not at least {least}")
+    if typed.seed > _LARGEST_SEED:
+        raise NsmError(f"setting seed: {typed.seed} is more than {_LARGEST_SEED}")
     if typed.trainer.precision not in PRECISIONS:
         words = ", ".join(PRECISIONS)
         raise NsmError(f"setting trainer.precision: {typed.trainer.precision} is not of {words}")
@@ -299,6 +314,10 @@ def _check_values(key: str, value: Any) -> None:
     elif isinstance(value, list):
         for item in value:
             _check_values(key, item)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise NsmError(f"setting {key}: {value} is no finite number")
+    elif isinstance(value, int) and abs(value) > _LARGEST_NUMBER:
+        raise NsmError(f"setting {key}: {value} is too large a number")
     elif isinstance(value, str):
         if "${" in value:
             raise NsmError(f"setting {key}: '${{' is not taken in a value; rename the file")

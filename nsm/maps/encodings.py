@@ -217,6 +217,10 @@ class SplineGrid(nn.Module):
         super().__init__()
         if in_dim != 2 or degree not in (2, 3):
             raise ValueError("the spline grid takes points of the plane and degree 2 or 3")
+        if not resolutions or min(resolutions) < 1:
+            raise ValueError("encoding.resolutions needs one level or more, of 1 cell or more each")
+        if features < 1 or extent <= 0:
+            raise ValueError("encoding.features and encoding.extent must be positive")
         self.resolutions = [int(r) for r in resolutions]
         self.degree, self.extent, self.features = degree, float(extent), features
         self.sides = [r + degree for r in self.resolutions]  # of the tables

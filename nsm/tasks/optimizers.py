@@ -137,6 +137,8 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
     """
     rest = dict(settings)
     name, encoding_lr = rest.pop("name"), rest.pop("encoding_lr", None)
+    if encoding_lr is not None and encoding_lr < 0:
+        raise ValueError(f"optimizer.encoding_lr={encoding_lr} is negative")
     if name not in OPTIMIZERS:
         raise ValueError(f"optimizer {name!r} is not one of {', '.join(OPTIMIZERS)}")
     named = {key: p for key, p in module.named_parameters() if p.requires_grad}
@@ -152,7 +154,8 @@ def build_optimizer(module: nn.Module, settings: dict[str, Any]) -> Optimizer:
             raise ValueError(f"optimizer {name!r}: the network has no matrices; take adam")
         groups.insert(0, {"params": [named[key] for key in matrices], "name": "matrices"})
     if grids:
-        groups.append({"params": grids, "lr": encoding_lr or rest["lr"], "name": "encoding"})
+        rate = rest["lr"] if encoding_lr is None else encoding_lr
+        groups.append({"params": grids, "lr": rate, "name": "encoding"})
     if name in _FUSED and not rest.get("foreach"):
         rest.setdefault("fused", True)
     try:
@@ -299,6 +302,9 @@ def build_scheduler(optimizer: Optimizer, settings: dict[str, Any], max_steps: i
     name, warmup, peak = rest.pop("name"), rest.pop("warmup", 0), rest.pop("peak", 1.0)
     if name not in SCHEDULERS:
         raise ValueError(f"scheduler {name!r} is not one of {', '.join(SCHEDULERS)}")
+    for key, value in {**rest, "warmup": warmup, "peak": peak}.items():
+        if value < 0:
+            raise ValueError(f"scheduler.{key}={value} is negative")
     try:
         factor = SCHEDULERS[name](max_steps, **rest)
     except TypeError as error:
