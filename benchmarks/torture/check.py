@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,10 @@ from nsm.pipeline.alone import LOCK_FILE
 # φ after the few steps of a trial may be this far from the mesh, in percent of the diagonal (RMS)
 NEAR_PERCENT = 15.0
 _ROUNDING = 1e-9
+# of a map's network, which computes in single precision
+_SINGLE = 1e-6
+# of twice an area within Ω, in double precision: what is smaller is computed anew, in fractions
+_UNSURE = 1e-14
 
 
 def complaints(folder: Path, task: str, mesh: tuple[np.ndarray, np.ndarray]) -> list[str]:
@@ -34,6 +39,8 @@ def complaints(folder: Path, task: str, mesh: tuple[np.ndarray, np.ndarray]) -> 
         found += _surface(file.parent, mesh if k == 0 and task != "pair_map" else None)
     if task == "overfit":
         found += _reconstruction(folder)
+    else:
+        found += _map(folder, task)
     return found
 
 
@@ -160,29 +167,46 @@ def boundary(faces: np.ndarray) -> np.ndarray | None:
     return np.array(loop) if len(loop) == len(rim) else None
 
 
-def injective(faces: np.ndarray, uv: np.ndarray, domain: str) -> Iterator[str]:
+def injective(
+    faces: np.ndarray, uv: np.ndarray, domain: str, rounding: float = _ROUNDING
+) -> Iterator[str]:
     """Complaints unless uv maps a disc injectively into Ω.
 
     It does if all triangles are counter-clockwise and the boundary goes once around ∂Ω, which is
     convex, without turning back.
     """
-    a, b, c = (uv[faces[:, k]] for k in range(3))
-    double = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    if not (double > 0).all():
-        yield f"{int((~(double > 0)).sum())} triangles of the domain are folded"
+    folded = _folded(faces, uv)
+    if folded:
+        yield f"{folded} triangles of the domain are folded"
     reach = np.linalg.norm(uv, axis=1) if domain == "disc" else np.abs(uv).max(axis=1)
-    if reach.max() > 1 + _ROUNDING:
+    if reach.max() > 1 + rounding:
         yield f"a vertex is outside the domain, at {reach.max()}"
     loop = boundary(faces)
     if loop is None:
         return
-    if np.abs(reach[loop] - 1).max() > _ROUNDING:
+    if np.abs(reach[loop] - 1).max() > rounding:
         yield "the boundary is not on that of the domain"
     p = uv[loop]
     q = np.roll(p, -1, axis=0)
-    turn = np.arctan2(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0], (p * q).sum(axis=1))
+    turn = np.arctan2(_double_areas(p, q, np.zeros_like(p)), (p * q).sum(axis=1))
     if not (turn > 0).all() or not math.isclose(turn.sum(), 2 * math.pi, rel_tol=1e-9):
         yield "the boundary does not go once around the domain"
+
+
+def _folded(faces: np.ndarray, uv: np.ndarray) -> int:
+    """How many triangles are not counter-clockwise."""
+    return int((_double_areas(*(uv[faces[:, k]] for k in range(3))) <= 0).sum())
+
+
+def _double_areas(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Twice the signed areas (N,) of triangles abc within Ω, with the right signs."""
+    double = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    for k in np.flatnonzero(np.abs(double) < _UNSURE).tolist():
+        (x, y), (s, t), (u, v) = ([Fraction(float(z)) for z in p[k]] for p in (a, b, c))
+        exact = (s - x) * (v - y) - (t - y) * (u - x)
+        # the least number stands for what is smaller
+        double[k] = float(exact) or math.copysign(5e-324, exact) if exact else 0.0
+    return double
 
 
 def _reconstruction(folder: Path) -> Iterator[str]:
@@ -199,3 +223,32 @@ def _reconstruction(folder: Path) -> Iterator[str]:
         again = np.asarray(trimesh.load(written, process=False).vertices)
         if again.shape != points.shape or np.abs(again - points).max() > 1e-5 * diagonal:
             yield "the reconstruction is not φ at the mesh's vertices"
+
+
+def _map(folder: Path, task: str) -> Iterator[str]:
+    """Whether a map onto Ω, as it is given back and in the file with its coordinates, is injective
+    where it is said to be, and not where it is said not to be."""
+    certified = json.loads((folder / "metrics.json").read_text())["certified"]
+    source, name = (
+        (folder, "parameterized")
+        if task == "param"
+        else (folder / "source", "source_with_target_uv")
+    )
+    faces = load_file(source / "surface.safetensors")["surface.faces"]
+    domain = json.loads((source / "surface.json").read_text())["surface"]["domain"]
+    result = nsm.load(folder)
+    image = result.uv if task == "param" else result.image_uv
+    found = list(injective(faces, image, domain, _SINGLE))
+    if certified:
+        yield from (f"certified, but {words}" for words in found)
+        folded = _folded(faces, _coordinates(folder / f"{name}.obj"))
+        if folded:
+            yield f"certified, but {folded} triangles of {name}.obj are folded"
+    elif not found:
+        yield "injective, but not certified"
+
+
+def _coordinates(file: Path) -> np.ndarray:
+    """The texture coordinates (V, 2) of an OBJ, as they are written."""
+    lines = (line.split() for line in file.read_text().splitlines())
+    return np.array([words[1:] for words in lines if words[:1] == ["vt"]], dtype=float)
