@@ -64,7 +64,8 @@ class SurfaceSampler:
     def with_jacobian(
         self, count: int, boundary_every: int, generator: torch.Generator
     ) -> tuple[Samples, Tensor]:
-        """``count`` points, and the Jacobian (N, 3, 2) of f: Ω → mesh there.
+        """``count`` points, and the Jacobian (N, 3, 2) of f: Ω → mesh there; zero where a triangle
+        has no area in Ω in single precision.
 
         The first of every ``boundary_every`` points is on the mesh's boundary, uniform by length;
         the others are uniform by area.
@@ -75,8 +76,9 @@ class SurfaceSampler:
         plane, space = self.uv[self.faces[face]].double(), self.vertices[self.faces[face]].double()
         sides = torch.stack([plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0]], dim=2)
         edges = torch.stack([space[:, 1] - space[:, 0], space[:, 2] - space[:, 0]], dim=2)
-        jacobian = torch.linalg.solve_ex(sides, edges, left=False).result
-        return self._at(face, weights), jacobian.to(self.vertices.dtype)
+        jacobian = torch.linalg.solve_ex(sides, edges, left=False).result.to(self.vertices.dtype)
+        finite = torch.isfinite(jacobian).flatten(1).all(dim=1)[:, None, None]
+        return self._at(face, weights), torch.where(finite, jacobian, 0.0)
 
     def _boundary_places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Faces (N,) and barycentric weights (N, 3) of points uniform by length on the boundary."""

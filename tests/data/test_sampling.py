@@ -103,6 +103,15 @@ def test_one_of_so_many_samples_is_on_the_boundary_by_length(uneven):
         assert any(met[list(face)].all() for face in uneven.faces)
 
 
+def test_jacobians_are_finite_where_single_precision_loses_a_triangle(uneven):
+    uv = uneven.uv.copy()
+    uv[uneven.faces[0]] = uv[uneven.faces[0, 0]] + np.array([[0, 0], [1e-12, 0], [0, 1e-12]])
+    sampler = SurfaceSampler(dataclasses.replace(uneven, uv=uv))
+    jacobian = sampler.with_jacobian(20_000, 3, sampler.generator(0))[1]
+    assert torch.isfinite(jacobian).all()
+    assert (jacobian == 0).flatten(1).all(dim=1).any()
+
+
 def test_a_batch_depends_on_seed_and_step_alone(uneven):
     first, again = (OverfitData(uneven, batch_size=64, seed=3) for _ in range(2))
     first.setup()
