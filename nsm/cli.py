@@ -6,14 +6,17 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from nsm.arguments import Arguments
 from nsm.config import checked, conf_folder, one_line, register_resolvers
 from nsm.errors import NsmError, of_disk
 from nsm.folders import remove_empty
@@ -73,6 +76,8 @@ def main() -> None:
         _command(COMMANDS[words[0]], words[1:])
     elif {"--help", "-h"} & set(words):
         _command("nsm.help", [word for word in words if not word.startswith("-")])
+    elif "--version" in words:  # Hydra would tell its own
+        print(f"nsm {version('nsm')}")
     else:
         _tasks()
 
@@ -99,6 +104,7 @@ def _tasks() -> None:
         good.append(_run(config))
 
     try:
+        _check_flags(sys.argv[1:])
         import_plugins()
         job()
     except NsmError as error:
@@ -116,6 +122,21 @@ def _tasks() -> None:
         sys.exit(2)
     if OUTCOMES:
         _sum_up()
+
+
+def _check_flags(words: Sequence[str]) -> None:
+    """NsmError for flags that Hydra would answer with its usage, or with a traceback."""
+    parser = Arguments(prog="nsm", add_help=False, parents=[get_args_parser()])
+    given, rest = parser.parse_known_args(words)
+    if rest and rest[0].startswith("-"):
+        raise NsmError(f"{rest[0]}: no flag is called so; see nsm --help and nsm --hydra-help")
+    if rest:
+        raise NsmError(f"{rest[0]}: give flags, such as -m, before all settings")
+    if given.resolve and not given.cfg:
+        raise NsmError("--resolve: give it with --cfg job")
+    modes = ("run", "multirun", "cfg", "info", "shell_completion")
+    if sum(bool(getattr(given, mode)) for mode in modes) > 1:
+        raise NsmError("-r, -m, --cfg, --info and -sc exclude each other; give one")
 
 
 def _sum_up() -> None:

@@ -2,6 +2,7 @@
 
 import sys
 import types
+from importlib.metadata import version
 
 import pytest
 
@@ -44,3 +45,25 @@ def test_other_words_are_settings(echo, here):
     result = here("eco")
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--foo"], "--foo: no flag is called so"),
+        (["-m", "--foo", "seed=1,2"], "--foo: no flag is called so"),
+        (["seed=1", "-m", "domain=disc,square"], "domain=disc,square: give flags, such as -m, bef"),
+        (["--cfg", "jobs"], "'jobs'"),
+        (["--resolve"], "--cfg job"),
+        (["-m", "--cfg", "job"], "exclude each other"),
+    ],
+)
+def test_a_mistaken_flag_is_told_in_one_line(here, words, told):
+    result = here(*words)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert told in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_the_version_is_ours(here):
+    assert here("--version").stdout == f"nsm {version('nsm')}\n"
