@@ -62,6 +62,34 @@ def test_help_on_a_group_tells_its_settings(here):
 
 
 @pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("landmarks", "landmarks=null"),
+        ("source=a.obj", "source=null"),
+        ("guarantee", "guarantee.rounds=2"),
+        ("trainer.max_steps", "experiment=paper"),
+    ],
+)
+def test_help_on_a_setting_tells_where_it_stands(here, name, expected):
+    result = here("--help", name)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert expected in result.stdout
+    assert "seed=" not in result.stdout
+
+
+def test_help_near_a_setting(here):
+    assert "'energy.lambda_normal'" in here("--help", "lambda_normal").stderr
+
+
+def test_help_folds_no_setting(here, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for group in groups():
+        lines = here("--help", group.name).stdout.splitlines()
+        for setting in (s for option in group.options for s in option.settings):
+            assert any(f" {setting.key}={setting.value} " in f"{line} " for line in lines)
+
+
+@pytest.mark.parametrize(
     ("line", "expected"),
     [
         ("nsm activation=s", "activation=softplus"),
