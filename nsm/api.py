@@ -24,7 +24,9 @@ from nsm.results import (
     load_surface,
     load_surface_map,
 )
+from nsm.results.report.runs import run_folders
 from nsm.surfaces import Surface
+from nsm.sweeps import is_complete
 
 
 def overfit(
@@ -210,12 +212,30 @@ def load(
     Raises:
         NsmError: nothing there, or a file that is damaged or of another version.
     """
-    if not Path(folder).exists():
+    place = Path(folder)
+    if not place.exists():
         raise NsmError(f"{folder}: no such folder; give the folder of a run")
-    if (Path(folder) / "collection.json").exists():
+    if (place / "collection.json").exists():
         return load_collection(folder)
-    if (Path(folder) / "pair.json").exists():
+    if (place / "pair.json").exists():
         return load_surface_map(folder)
-    if (Path(folder) / "map.json").exists():
+    if (place / "map.json").exists():
         return load_parameterization(folder)
+    if place.is_dir() and not list(place.glob("surface.*")):
+        raise NsmError(f"{folder}: {_no_result(place)}")
     return load_surface(folder)
+
+
+def _no_result(folder: Path) -> str:
+    """What a folder without a result is, and what to give instead."""
+    within = [place for place in run_folders(folder) if is_complete(place)]
+    if folder in within:
+        return "a run's figures, but not its result; copy the folder or make the run again"
+    if within:
+        give = "one of them, for example" if len(within) > 1 else "it:"
+        newest = max(within, key=lambda place: (place / "metrics.json").stat().st_mtime)
+        runs = f"{len(within)} run{'s' if len(within) > 1 else ''}"
+        return f"a folder of {runs}; give {give} {newest}"
+    if (folder / "config.yaml").exists():
+        return f"a run that has not ended; nsm resume={folder} goes on with it"
+    return "no run there; give the folder of a run"

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import resource
 import shutil
 import zipfile
@@ -281,6 +282,21 @@ def test_a_safetensors_header_that_lies(copy):
         changed(copy, sha256=hashlib.sha256(data).hexdigest())
         with pytest.raises(NsmError):
             nsm.load(copy)
+
+
+def test_folders_that_hold_no_result(finished, copy, tmp_path):
+    with pytest.raises(NsmError, match=rf"folder of 1 run; give it: {re.escape(str(copy))}$"):
+        nsm.load(tmp_path)
+    shutil.copytree(finished, tmp_path / "other" / "deeper")
+    with pytest.raises(NsmError, match="folder of 2 runs; give one of them, for example "):
+        nsm.load(tmp_path)
+    for file in ("metrics.json", "surface.json", "surface.safetensors"):
+        (copy / file).unlink()
+    with pytest.raises(NsmError, match=f"not ended; nsm resume={re.escape(str(copy))} goes on"):
+        nsm.load(copy)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(NsmError, match="no run there"):
+        nsm.load(tmp_path / "empty")
 
 
 def test_mistaken_arguments_in_python(tmp_path):

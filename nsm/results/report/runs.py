@@ -58,7 +58,7 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
     for folder in folders:
         if not folder.is_dir():
             raise NsmError(f"{folder}: no such folder; give folders of runs or sweeps")
-        for place in _run_folders(folder):
+        for place in run_folders(folder):
             if place.resolve() in seen:
                 continue
             seen.add(place.resolve())
@@ -79,7 +79,8 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
     return runs, incomplete
 
 
-def _run_folders(folder: Path) -> Iterator[Path]:
+def run_folders(folder: Path) -> Iterator[Path]:
+    """The folders of runs, complete or not, in a folder, however deep."""
     for path, inner, files in os.walk(folder):
         inner.sort(key=lambda name: (len(name), name) if name.isdigit() else (0, name))
         if not {"metrics.json", "config.yaml", "error.txt"}.isdisjoint(files):
