@@ -110,7 +110,8 @@ def map_pair(
         source: a neural surface, the folder of one, a mesh file, or a name of the catalogue.
         target: the same; or an analytic surface, by name or as ``{"name": ..., parameters}``.
         landmarks: pairs ``[(i, j), ...]`` of vertices of the two mesh files, or of points (x, y,
-            z); or a JSON file of them; or two files, one for each surface.
+            z), in lists, an array or a tensor; or a JSON file of them; or two files, one for each
+            surface.
         overrides: settings as on the command line, e.g. ``["energy=arap"]``.
         folder: where to leave the run's files; without it they are not kept.
         progress: show a progress bar.

@@ -20,6 +20,7 @@ from nsm.surfaces import Surface
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.landmarks import (
     Landmarks,
+    as_lists,
     as_vertices,
     check_equal_lengths,
     listed,
@@ -112,7 +113,9 @@ def _lists(given: Any, count: int) -> list[Any]:
         except KeyError as error:
             raise NsmError(f"landmarks: {error} is missing beside the other list") from None
     else:
-        lists = list(given) if isinstance(given, (list, tuple)) else _rows(given)
+        lists = as_lists(given)
+        if not isinstance(lists, list):
+            raise NsmError("landmarks: neither lists of landmarks nor files")
         if count == 2 and lists and all(_is_pair(item) for item in lists):
             lists = [[pair[0] for pair in lists], [pair[1] for pair in lists]]
         lists = [read_landmarks(x) if isinstance(x, (str, Path)) else x for x in lists]
@@ -123,20 +126,13 @@ def _lists(given: Any, count: int) -> list[Any]:
     return lists
 
 
-def _rows(given: Any) -> list[Any]:
-    """The rows of an array of landmarks, for example of pairs (L, 2)."""
-    if not isinstance(given, np.ndarray) or given.ndim == 0:
-        raise NsmError("landmarks: neither lists of landmarks nor files")
-    return list(given)
-
-
 def _is_pair(item: Any) -> bool:
     """Whether an entry is a pair of landmarks, as against a whole list of one surface's.
 
     Two lists of two vertices each would look the same; as two pairs they say more often what is
     meant, as pairs are what the documentation shows.
     """
-    return isinstance(item, (list, tuple, np.ndarray)) and len(item) == 2
+    return isinstance(item, list) and len(item) == 2
 
 
 def _name(shape: Shape) -> str:

@@ -134,18 +134,30 @@ def check_equal_lengths(names: Sequence[str], lists: Sequence[Landmarks]) -> Non
         raise NsmError(f"landmarks: {told}; give each surface the same ones, in the same order")
 
 
+def as_lists(given: Any) -> Any:
+    """Arrays and tensors as lists, those within lists too; anything else as it is."""
+    if hasattr(given, "tolist"):
+        return given.tolist()
+    if isinstance(given, Sequence) and not isinstance(given, (str, bytes)):
+        return [as_lists(item) for item in given]
+    return given
+
+
 def listed(given: Any, what: str) -> Landmarks:
     """Landmarks as a list of vertex numbers, or as points (L, 3).
 
     Raises:
         NsmError: anything else.
     """
-    if isinstance(given, np.ndarray):
-        given = given.tolist()
-    if not isinstance(given, Sequence) or isinstance(given, (str, bytes)):
+    given = as_lists(given)
+    if not isinstance(given, list):
         raise NsmError(f"{what}: not a list of landmarks")
-    given = list(given)
-    if all(isinstance(x, (int, np.integer)) and not isinstance(x, bool) for x in given):
+    if all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in given):
+        for k, x in enumerate(given):
+            if not float(x).is_integer():  # np.loadtxt gives whole numbers as floats
+                raise NsmError(
+                    f"{what}: landmark {k} is {x}; vertex numbers are whole, points [x, y, z]"
+                )
         return [int(x) for x in given]
     try:
         points = np.array(given, dtype=np.float64)

@@ -82,9 +82,15 @@ def as_arrays(vertices: Any, faces: Any, name: str) -> tuple[np.ndarray, np.ndar
 
 def check_arrays(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     """NsmError unless vertices are (V,3) finite and faces (F,3) valid indices, F > 0."""
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
+    for what, array in (("vertices", vertices), ("faces", faces)):
+        if array.size and (array.ndim != 2 or array.shape[1] != 3):
+            raise NsmError(
+                f"{name}: {what} of shape {array.shape}; give points in space (V, 3) and triangles "
+                "(F, 3)"
+            )
+    if vertices.size == 0:
         raise NsmError(f"{name}: holds no 3D vertices; export it again as a triangle mesh")
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+    if faces.size == 0:
         raise NsmError(f"{name}: holds no faces (a point cloud or text?); give a triangle mesh")
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])

@@ -397,7 +397,9 @@ def test_landmarks_come_in_many_forms(tmp_path):
     (tmp_path / "pairs.json").write_text("[[1, 3], [2, 4]]")
     forms = [
         [[1, 3], [2, 4]],
-        np.array([[1, 3], [2, 4]]).tolist(),
+        np.array([[1.0, 3.0], [2.0, 4.0]]),  # as np.loadtxt gives it
+        torch.tensor([[1, 3], [2, 4]]),
+        [(np.int64(1), torch.tensor(3)), (np.float64(2), 4)],
         {"source": [1, 2], "target": [3, 4]},
         str(tmp_path / "pairs.json"),
         [[vertices[1].tolist(), 3], [vertices[2].tolist(), 4]],
@@ -408,3 +410,6 @@ def test_landmarks_come_in_many_forms(tmp_path):
     both = landmark_vertices([str(tmp_path / "a.txt")] * 2, shapes)
     assert both[0].tolist() == both[1].tolist() == [1, 2]
     assert [len(x) for x in landmark_vertices(None, shapes)] == [0, 0]
+    for form in ([[1, 3], [2.5, 4]], [[1, 3], [float("nan"), 4]]):
+        with pytest.raises(NsmError, match="landmark 1 is .*; vertex numbers are whole"):
+            landmark_vertices(form, shapes)

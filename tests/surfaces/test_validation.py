@@ -153,6 +153,8 @@ NOTHING = np.zeros((0, 3))
         (renumbered(-1), "names vertex -1"),
         ((NOTHING, NOTHING.astype(int)), "no 3D vertices"),
         ((ball()[0], NOTHING.astype(int)), "no faces"),
+        ((ball()[0], np.zeros((2, 4), int)), r"faces of shape \(2, 4\)"),
+        ((ball()[0][:, :2], ball()[1]), r"vertices of shape \(\d+, 2\)"),
         ((np.zeros((4, 3)), TETRAHEDRON[1]), "zero area"),
         ((TETRAHEDRON[0], np.array([[0, 0, 1], [2, 2, 3]])), "zero area"),
         ((ball()[0] * [1, 0, 0], ball()[1]), "zero area"),
