@@ -67,7 +67,8 @@ class _Tracer:
     def path(self, i: int, j: int, leave: list[int], arrive: list[int]) -> tuple[float, list[int]]:
         """The cheapest free path between landmarks i and j, and its cost (inf if there is none).
 
-        Its second vertex is one of ``leave`` (or j itself), its last but one of ``arrive``.
+        Its second vertex is one of ``leave`` (or j itself, where there are further landmarks), its
+        last but one of ``arrive``.
         """
         a, b = int(self.landmarks[i]), int(self.landmarks[j])
         x, y = self.edges.T
@@ -76,7 +77,9 @@ class _Tracer:
             far = np.where(x == end, y, x)
             touches = (x == end) | (y == end)
             keep |= touches & np.isin(far, gates) & ~self.taken[far]
-            if other in gates and end in (arrive if other == b else leave):
+            # with no further branch, a seam of one edge would leave the mesh closed
+            straight = len(self.landmarks) > 2
+            if straight and other in gates and end in (arrive if other == b else leave):
                 keep |= touches & (far == other)
         n = len(self.vertices)
         graph = csr_matrix((self.cost[keep], (x[keep], y[keep])), shape=(n, n))

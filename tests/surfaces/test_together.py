@@ -69,6 +69,17 @@ def test_the_walk_around_the_seam_passes_landmarks_in_the_same_order(pair):
     assert (alike[0][:, 0] == alike[1][:, 0]).all()
 
 
+def test_two_landmarks_side_by_side_are_no_seam_of_one_edge():
+    vertices, faces = ball(2)
+    far = nearest(vertices, POINTS[::3])
+    ids = [far, faces[faces[:, 0] == far[0]][0, :2]]
+    paths = corresponding_paths([(vertices, faces)] * 2, ids)
+    assert paths is not None
+    for own, path in zip(ids, paths, strict=True):
+        assert [path[0][0], path[0][-1]] == own.tolist()
+        assert topology.is_disc(cut_along_paths(vertices, faces, path).faces)
+
+
 def test_walks_in_other_orders_are_not_alike():
     walk = np.array([[0, 5], [1, 6], [2, 7]])
     assert turned_alike([walk, walk[[0, 2, 1]]]) is None
