@@ -55,7 +55,7 @@ def overfit(
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
     _expect(surface, Surface)
-    words = ["task=overfit", *_listed(overrides), f"domain={surface.domain}"]
+    words = _words("overfit", overrides, [surface], ("landmarks",))
     with _place(folder, words, progress) as (config, place):
         return run_overfit(config, place, surface)
 
@@ -87,7 +87,7 @@ def parameterize(
         >>> flat.uv  # (V, 2), of the cut mesh's vertices
     """
     _expect(phi, NeuralSurface)
-    words = ["task=param", *_listed(overrides), f"domain={phi.surface.domain}"]
+    words = _words("param", overrides, [phi.surface], ("landmarks",))
     with _place(folder, words, progress) as (config, place):
         return run_param(config, place, phi)
 
@@ -126,10 +126,8 @@ def map_pair(
         >>> f = nsm.map_pair("cat.obj", "horse.obj", landmarks=[(5259, 2289), (3651, 5255)])
         >>> f(points)  # (N, 3) on the cat to (N, 3) on the horse
     """
-    words = ["task=pair_map", *_listed(overrides)]
-    ready = [end for end in (source, target) if isinstance(end, NeuralSurface)]
-    if ready:
-        words.append(f"domain={ready[0].surface.domain}")
+    ready = [end.surface for end in (source, target) if isinstance(end, NeuralSurface)]
+    words = _words("pair_map", overrides, ready, () if landmarks is None else ("landmarks",))
     with _place(folder, words, progress) as (config, place):
         return run_pair_map(config, place, source, target, landmarks)
 
@@ -161,18 +159,52 @@ def map_collection(
     """
     if not isinstance(surfaces, Sequence):
         raise NsmError("surfaces: give a list of them")
-    words = ["task=collection_map", *_listed(overrides)]
-    ready = [surface for surface in surfaces if isinstance(surface, NeuralSurface)]
-    if ready:
-        words.append(f"domain={ready[0].surface.domain}")
+    ready = [phi.surface for phi in surfaces if isinstance(phi, NeuralSurface)]
+    words = _words("collection_map", overrides, ready, () if landmarks is None else ("landmarks",))
     with _place(folder, words, progress) as (config, place):
         return run_collection_map(config, place, surfaces, landmarks)
 
 
-def _listed(overrides: Sequence[str]) -> Sequence[str]:
+# what the function that is called, and its arguments, say
+_SAID = (
+    "task",
+    "surface",
+    "surface.path",
+    "surface.name",
+    "phi.path",
+    "source",
+    "target",
+    "surfaces",
+)
+
+
+def _words(
+    task: str, overrides: Sequence[str], ready: Sequence[Surface], said: Sequence[str]
+) -> list[str]:
+    """The settings of a call.
+
+    Args:
+        task: of the function.
+        overrides: as the user gives them.
+        ready: the prepared surfaces that it is called with: their domain is taken.
+        said: settings, beside :data:`_SAID`, that its arguments say.
+
+    Raises:
+        NsmError: no list of settings, or one that would do nothing beside the arguments.
+    """
     if isinstance(overrides, str) or not all(isinstance(word, str) for word in overrides):
         raise NsmError('overrides: give a list of settings, as in ["trainer.max_steps=1000"]')
-    return overrides
+    own = [f"task={task}", *(f"domain={surface.domain}" for surface in ready[:1])]
+    for word in overrides:
+        key = word.lstrip("+~").split("=")[0]
+        if key == "resume":
+            raise NsmError(f"overrides: {word}: a run goes on with the command, nsm {word}")
+        taken = key in (*_SAID, *said) or (key == "domain" and ready)
+        if taken and word not in own:
+            raise NsmError(
+                f"overrides: {word}: the function and its arguments say that; leave it out"
+            )
+    return [own[0], *overrides, *own[1:]]
 
 
 def _expect(given: Any, kind: type) -> None:

@@ -303,6 +303,21 @@ def test_mistaken_arguments_in_python(tmp_path):
     hemisphere = nsm.Surface.load("hemisphere")
     with pytest.raises(NsmError, match="give a list of settings"):
         nsm.overfit(hemisphere, overrides="experiment=quick")
+    for word in (
+        "task=param",
+        "surface=cow",
+        "surface.path=a.obj",
+        "domain=square",
+        "source=a.obj",
+    ):
+        with pytest.raises(NsmError, match=f"overrides: {word}: the function"):
+            nsm.overfit(hemisphere, overrides=[*TINY, word])
+    with pytest.raises(NsmError, match="landmarks=a.json: the function"):
+        nsm.map_pair("cone", "saddle", [], overrides=["landmarks=a.json"])
+    with pytest.raises(NsmError, match="surfaces=null: the function"):
+        nsm.map_collection(["cone"] * 3, overrides=["surfaces=null"])
+    with pytest.raises(NsmError, match="nsm resume=run"):
+        nsm.overfit(hemisphere, overrides=["resume=run"])
     with pytest.raises(NsmError, match=r"Surface\.from_arrays"):
         nsm.Surface.load(hemisphere)
     with pytest.raises(NsmError, match="no such folder"):
