@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 # Raise it when the preparation changes, so that no older result is taken for a new one.
-PREPARATION_VERSION = 5
+PREPARATION_VERSION = 6
 
 
 def cache_folder() -> Path:

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.geometry import ambient_occlusion
 
 # A sector at a landmark: the branch after which, counter-clockwise, it comes; -1 with no branch.
 _WHOLE = -1
@@ -199,11 +200,7 @@ def seam_costs(vertices: np.ndarray, faces: np.ndarray, seam: str) -> np.ndarray
         return length
     if seam != "hidden":
         raise NsmError(f"seam={seam} is not one of {', '.join(SEAMS)}")
-    import igl
-
-    normals = igl.per_vertex_normals(vertices, faces)
-    hidden = np.asarray(igl.ambient_occlusion(vertices, faces, vertices, normals, 200)).ravel()
-    visible = 1 - hidden[topology.edges_of(faces).pairs].mean(axis=1)
+    visible = 1 - ambient_occlusion(vertices, faces)[topology.edges_of(faces).pairs].mean(axis=1)
     return length * (1 + _VISIBLE_COST * visible)
 
 
