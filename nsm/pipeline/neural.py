@@ -16,8 +16,8 @@ from rich.console import Console
 
 from nsm.config import compose_config
 from nsm.errors import NsmError
-from nsm.pipeline.common import CHECKPOINT_FILE, Run, configured_surface, plain
-from nsm.pipeline.overfit import common_settings, leave_results, overfit_together, run_overfit
+from nsm.pipeline.common import CHECKPOINT_FILE, Run, configured_surface, plain, report_surface
+from nsm.pipeline.overfit import common_settings, leave_results, overfit_together, overfitted
 from nsm.results import NeuralSurface, load_surface
 from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
@@ -68,6 +68,7 @@ def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralS
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
+    report_surface(console, surface)
     return _made(surface, _settings_of_phi(config), console)
 
 
@@ -78,13 +79,15 @@ def _made(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurf
             console.print(f"{surface.name}: neural surface taken from the cache")
             # equal in Ω, but perhaps of another file, with its own units, place and vertex numbers
             return replace(load_surface(folder), surface=surface)
-        return run_overfit(overfit, folder, surface, resuming=(folder / CHECKPOINT_FILE).exists())
+        resuming = (folder / CHECKPOINT_FILE).exists()
+        started = time.monotonic()
+        return overfitted(overfit, folder, surface, console, started, resuming=resuming)
 
 
 def made_together(
     surfaces: Sequence[Surface], config: DictConfig, console: Console, *, in_one_batch: bool
 ) -> list[NeuralSurface]:
-    """As :func:`made_once` of each.
+    """As :func:`made_once` of each, but nothing is reported of the prepared ones.
 
     Args:
         surfaces: prepared ones.

@@ -69,6 +69,28 @@ def run_overfit(
     if surface is None:
         surface = configured_surface(config)
     report_surface(console, surface)
+    return overfitted(config, folder, surface, console, started, resuming=resuming)
+
+
+def overfitted(
+    config: DictConfig,
+    folder: Path,
+    surface: Surface,
+    console: Console,
+    started: float,
+    *,
+    resuming: bool,
+) -> NeuralSurface:
+    """:func:`run_overfit` of a surface that has been reported.
+
+    Args:
+        config, folder, surface, resuming: as for :func:`run_overfit`.
+        console: where to print.
+        started: when the run began, by ``time.monotonic``.
+
+    Raises:
+        NsmError: as :func:`run_overfit`.
+    """
     module = build_overfit(config, surface)
     shown = surface
     pictures = _pictures(config, lambda module: shown)

@@ -216,6 +216,7 @@ def test_analytic_targets_and_no_landmarks(here, domain):
         "artefacts=false",
     )
     assert run.returncode == 0, run.stderr
+    assert run.stdout.count(" faces on the ") == 1  # the source is reported once
     folder = run.stdout.strip().splitlines()[-1].removeprefix("results in ")
     f = nsm.load(folder)
     assert f.target.surface.name == "graph"
