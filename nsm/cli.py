@@ -134,6 +134,8 @@ def _check_flags(words: Sequence[str]) -> None:
         raise NsmError(f"{rest[0]}: give flags, such as -m, before all settings")
     if given.resolve and not given.cfg:
         raise NsmError("--resolve: give it with --cfg job")
+    if given.experimental_rerun is not None:
+        raise NsmError("--experimental-rerun: nsm resume=FOLDER goes on with a run instead")
     modes = ("run", "multirun", "cfg", "info", "shell_completion")
     if sum(bool(getattr(given, mode)) for mode in modes) > 1:
         raise NsmError("-r, -m, --cfg, --info and -sc exclude each other; give one")

@@ -55,6 +55,7 @@ def test_other_words_are_settings(echo, here):
         (["seed=1", "-m", "domain=disc,square"], "domain=disc,square: give flags, such as -m, bef"),
         (["--cfg", "jobs"], "'jobs'"),
         (["--resolve"], "--cfg job"),
+        (["--experimental-rerun", "gone.pickle"], "nsm resume=FOLDER"),
         (["-m", "--cfg", "job"], "exclude each other"),
     ],
 )
