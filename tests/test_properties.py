@@ -327,6 +327,7 @@ def test_seams_preimages_and_choices(numbers, domain, method):
     s = NEURAL[0].surface
     try:
         assert s.preimages(numbers).shape == (len(numbers), 2)
+        assert set(s.kept(numbers)) <= set(s.source_vertex)
     except NsmError as error:
         assert "\n" not in str(error)
     try:
@@ -560,6 +561,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "Surface.from_stored": [test_surfaces_of_any_few_triangles],
     "Surface.to_stored": [test_surfaces_of_any_few_triangles],
     "Surface.content_key": [test_surfaces_of_any_few_triangles],
+    "Surface.kept": [test_seams_preimages_and_choices],
     "Surface.load": [test_a_name_of_nothing_is_told],
     "Surface.preimages": [test_seams_preimages_and_choices],
     "SurfaceCollection.__len__": [test_pairs_of_a_collection],

@@ -392,7 +392,7 @@ def test_mistakes_are_told_in_one_line(here, surfaces, tmp_path, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as busy:
         port = busy.getsockname()[1]
         cases = {
-            ("view", "elsewhere"): "elsewhere/surface.json: No such file",
+            ("view", "elsewhere"): "elsewhere: no such folder",
             ("view", "run", "--port", str(port)): f"port {port} is in use",
             ("view", "run", "--port", "70000"): "port 70000",
             ("view", "run", "--port", "0", "--host", "192.0.2.1"): "192.0.2.1",
