@@ -146,6 +146,10 @@ def _cut_alike(
     seam_landmarks: int | None,
 ) -> list[Surface]:
     total = len(landmarks[0])
+    costs = {
+        path: [seam_costs(c.vertices, c.faces, path) for c in cleaned]
+        for path in (SEAMS if seam == "auto" else (seam,))
+    }
     if seam == "auto":
         counts = (
             [seam_landmarks]
@@ -155,11 +159,12 @@ def _cut_alike(
         tried = [
             (_disagreement(way, landmarks), k, way)
             for k, (path, count) in enumerate(itertools.product(SEAMS, counts))
-            if (way := _opened_alike(meshes, cleaned, landmarks, path, count)) is not None
+            if (way := _opened_alike(meshes, cleaned, landmarks, path, costs[path], count))
+            is not None
         ]
         best = min(tried, default=(0.0, 0, None))[2]
     else:
-        best = _opened_alike(meshes, cleaned, landmarks, seam, seam_landmarks or total)
+        best = _opened_alike(meshes, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
     if best is None:
         raise NsmError(
             "no seams through the landmarks were found: some are too close together for the "
@@ -189,11 +194,12 @@ def _opened_alike(
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
     seam: str,
+    costs: Sequence[np.ndarray],
     count: int,
 ) -> _CutAlike | None:
-    """The meshes cut along one tree through ``count`` landmarks; None if there is no such tree."""
+    """The meshes cut along one tree through ``count`` landmarks, whose branches are the cheapest
+    by costs (E,) of each mesh's edges; None if there is no such tree."""
     pairs = [(c.vertices, c.faces) for c in cleaned]
-    costs = [seam_costs(vertices, faces, seam) for vertices, faces in pairs]
     chosen = mutually_far(pairs, landmarks, count)
     on_seam = [ids[chosen] for ids in landmarks]
     paths = corresponding_paths(pairs, on_seam, costs, avoid=landmarks)
