@@ -24,7 +24,6 @@ from nsm.results import (
     load_surface,
     load_surface_map,
 )
-from nsm.results.report.runs import run_folders
 from nsm.surfaces import Surface
 from nsm.sweeps import is_complete
 
@@ -261,6 +260,9 @@ def load(
 
 def _no_result(folder: Path) -> str:
     """What a folder without a result is, and what to give instead."""
+    # the report's libraries need not be there before something is wrong
+    from nsm.results.report.runs import run_folders
+
     within = [place for place in run_folders(folder) if is_complete(place)]
     if folder in within:
         return "a run's figures, but not its result; copy the folder or make the run again"

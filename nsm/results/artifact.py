@@ -17,6 +17,7 @@ from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, check_points
 from nsm.surfaces import Surface
+from nsm.surfaces.cutting import first_copies
 
 FORMAT = "nsm-surface"
 VERSION = 1
@@ -133,7 +134,10 @@ def load_surface(folder: str | Path) -> NeuralSurface:
         about = words["surface"]
         if "surface.cut_vertex" not in tensors:  # of a run that knew no merged vertices
             source = tensors["surface.source_vertex"].numpy()
-            tensors["surface.cut_vertex"] = torch.from_numpy(_first_copies(source))
+            if not 0 <= source.max() < _MOST_VERTICES:  # rows are made for each of them
+                raise ValueError("a vertex that no mesh file has")
+            copies = first_copies(source, int(source.max()) + 1)
+            tensors["surface.cut_vertex"] = torch.from_numpy(copies)
         arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in _ARRAYS}
         surface = Surface(
             name=str(about["name"]),
@@ -162,16 +166,6 @@ def _network(config: dict[str, Any], state: dict[str, Tensor]) -> nn.Module:
     if config.get("out_dim") != 3:
         raise ValueError("the network is no map to space")
     return network_of(build_map, config, state)
-
-
-def _first_copies(source_vertex: np.ndarray) -> np.ndarray:
-    """``cut_vertex`` (W,) of a surface whose ``source_vertex`` (V,) tells all that is known."""
-    if not 0 <= source_vertex.max() < _MOST_VERTICES:  # rows are made for each of them
-        raise ValueError("a vertex that no mesh file has")
-    known = np.flatnonzero(source_vertex >= 0)[::-1]
-    first = np.full(int(source_vertex.max()) + 1, -1, dtype=np.int64)
-    first[source_vertex[known]] = known
-    return first
 
 
 def _check_shapes(surface: Surface) -> None:

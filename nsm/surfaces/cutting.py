@@ -38,6 +38,15 @@ class Cut:
     log: tuple[str, ...]
 
 
+def first_copies(origin: np.ndarray, count: int) -> np.ndarray:
+    """Of each of ``count`` vertices the first (count,) that came from it, or -1, by the origin (V,)
+    of these, which is -1 for inserted ones."""
+    known = np.flatnonzero(origin >= 0)[::-1]
+    first = np.full(count, -1, dtype=np.int64)
+    first[origin[known]] = known  # the first copy wins
+    return first
+
+
 class _Graph:
     """The edge graph of a mesh with each boundary loop drawn together to one node."""
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+_DIRECTIONS = 200  # that ambient occlusion looks in
+
 
 def subdivide(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split each triangle in four at its edges' middles: points (V, d), faces (F, 3) of the new."""
@@ -30,11 +32,11 @@ def decimate(
     return np.asarray(kept), np.asarray(coarse, dtype=np.int64), np.asarray(birth)
 
 
-def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray, count: int = 200) -> np.ndarray:
+def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The share (V,) of a mesh's own half space that each vertex does not see for the mesh.
 
-    Of ``count`` directions, evenly spread: libigl's own function draws them anew at each call, and
-    a seam that is led by what is hidden would not come again.
+    Directions are evenly spread: libigl's own function draws them anew at each call, and a seam
+    that is led by what is hidden would not come again.
     """
     import igl
 
@@ -43,16 +45,16 @@ def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray, count: int = 200)
     normals = igl.per_vertex_normals(unit, faces)
     tree = igl.AABB()
     tree.init(unit, faces)
-    number = np.arange(count) + 0.5
-    height, angle = 1 - 2 * number / count, np.pi * (1 + 5**0.5) * number  # Fibonacci's spiral
-    radius = np.sqrt(1 - height**2)
+    number = np.arange(_DIRECTIONS) + 0.5
+    height, angle = 1 - 2 * number / _DIRECTIONS, np.pi * (1 + 5**0.5) * number
+    radius = np.sqrt(1 - height**2)  # Fibonacci's spiral
     hits = np.zeros(len(vertices))
     for direction in np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1):
         outward = np.where(normals @ direction < 0, -1.0, 1.0)[:, None] * direction
         start = unit + 1e-4 * outward  # off the mesh
         first, _, _ = tree.intersect_ray_first(unit, faces, start, outward)
         hits += first >= 0
-    return hits / count
+    return hits / _DIRECTIONS
 
 
 def point_mesh_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.cutting import Cut, cut_to_disc
+from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies
 from nsm.surfaces.domain import DOMAIN_AREA, DOMAINS, Keys
 from nsm.surfaces.flat import boundary_self_intersections, flipped_triangles
 from nsm.surfaces.landmarks import listed
@@ -209,9 +209,7 @@ class Surface:
                 f"{crossings} boundary crossings); give seam_vertices at the tips of long parts"
             )
         source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
-        known = np.flatnonzero(cut.origin >= 0)[::-1]
-        first = np.full(len(mesh.vertices), -1, dtype=np.int64)
-        first[cut.origin[known]] = known  # the first copy wins
+        first = first_copies(cut.origin, len(mesh.vertices))
         quality = {
             "flipped_triangles": float(flipped),
             "boundary_self_intersections": float(crossings),
