@@ -37,7 +37,7 @@ SETTINGS = [
     "logger.pictures=0",
 ]
 # sin(ωz) needs the start that was published with it
-OWN = {"sine": ["map.initialisation=siren"]}
+OWN = {"sine": ["map.initialization=siren"]}
 ACTIVATIONS = (
     "softplus",
     "softplus_paper",

@@ -98,8 +98,8 @@ def residuals(network: NeuralMap, batch: Samples, lambda_normal: float) -> Tenso
         value, slope = act.formulas.value_and_slope(value, **act.parameters_)
         stack = torch.stack([value, by_u * slope, by_v * slope])
     stack = linear(network.output, stack)
-    if network.readout is not None:
-        stack = stack + linear(network.readout, features)
+    if network.linear_skip is not None:
+        stack = stack + linear(network.linear_skip, features)
     value, by_u, by_v = stack.unbind()
     cross = torch.linalg.cross(by_u, by_v)
     turned = cross / (cross.square().sum(dim=1, keepdim=True) + NORMAL_FLOOR).sqrt()

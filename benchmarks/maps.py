@@ -33,7 +33,7 @@ VARIANTS = {
     "no term on the seam": ["constraints.lambda_seam=0"],
     "boundary by a penalty": ["constraints.boundary=penalty"],
     "surfaces from a random start": [
-        'phi.overrides=["start=random","encoding.resolutions=[16,64,256]"]'
+        'phi.overrides=["initialization=random","encoding.resolutions=[16,64,256]"]'
     ],
     "paper, as many steps": ["experiment=paper_pair", "trainer.max_steps=1500"],
 }

@@ -30,9 +30,9 @@ from nsm.surfaces.correspondence import (
 )
 from nsm.surfaces.cutting import cut_along_paths
 from nsm.surfaces.domain import Keys
+from nsm.surfaces.joint_preparation import common_fractions
 from nsm.surfaces.landmarks import read_landmarks
 from nsm.surfaces.loading import load_mesh
-from nsm.surfaces.together import common_fractions
 from nsm.surfaces.validation import CleanMesh, clean
 
 RESULTS = Path(__file__).parent / "results" / "redrawn_seam"

@@ -119,14 +119,14 @@ def overfit(mesh: Callable[[], shapes.Mesh], folder: Path) -> dict[str, Any]:
 def collection(folder: Path) -> dict[str, Any]:
     """task=collection_map of many surfaces, all ordered pairs of them."""
     from nsm.pipeline import collection_map as pipeline
-    from nsm.pipeline import inputs
+    from nsm.pipeline import resolve_inputs as inputs
 
     stages = Stages()
     for module, name, stage in (
-        (inputs, "prepare_together", "preparation"),
-        (inputs, "made_together", f"neural surfaces, {PHI_STEPS} steps"),
+        (inputs, "prepare_jointly", "preparation"),
+        (inputs, "made_batched", f"neural surfaces, {PHI_STEPS} steps"),
         (pipeline, "fitted", f"training, {COLLECTION_STEPS} steps"),
-        (pipeline, "guaranteed", "certificates"),
+        (pipeline, "certified", "certificates"),
         (pipeline, "collection_metrics", "figures"),
         (pipeline, "_write_artefacts", "meshes and pictures"),
     ):
@@ -136,7 +136,7 @@ def collection(folder: Path) -> dict[str, Any]:
     landmarks.write_text(json.dumps([LANDMARKS] * SURFACES))
     words = ["task=collection_map", f"trainer.max_steps={COLLECTION_STEPS}"]
     # so short a training leaves flips, and to mend them would take longer than all the rest
-    words += [f"landmarks={landmarks}", "guarantee.repair=false"]
+    words += [f"landmarks={landmarks}", "certification.repair=false"]
     words += [f"surfaces=[{','.join(files)}]", f'phi.overrides=["trainer.max_steps={PHI_STEPS}"]']
     found = whole_run(words, folder / "run", stages)
     pairs = metrics(folder)["metrics"]["pairs"].values()
@@ -209,7 +209,7 @@ def section(results: dict[str, Any]) -> list[str]:
         if "pairs" in found:
             text += (
                 f", {found['certified_pairs']} of {found['pairs']} ordered pairs certified "
-                "with nothing mended, after so short a training; "
+                "with nothing repaired, after so short a training; "
                 f"symmetric Dirichlet {found['symmetric_dirichlet_median']:.2f} in the median."
             )
         else:

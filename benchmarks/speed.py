@@ -37,11 +37,11 @@ from nsm.pipeline.pair_map import build_pair_map
 from nsm.pipeline.param import build_param
 from nsm.results import NeuralSurface, atomic_write
 from nsm.surfaces import Surface
+from nsm.surfaces.joint_preparation import matched_landmarks
 from nsm.surfaces.shapes import ring_mesh
 from nsm.surfaces.surface import as_it_lies
-from nsm.surfaces.together import matched_landmarks
 from nsm.tasks.compiling import Compiled
-from nsm.tasks.weakest import Weakest
+from nsm.tasks.fold_barrier import FoldBarrier
 
 RESULTS = Path(__file__).parent / "results"
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
@@ -250,7 +250,7 @@ def growth(rounds: int) -> dict[str, Any]:
         data.trainer = None
         data.setup()
         uv, faces = torch.as_tensor(surface.uv, dtype=torch.float32), torch.as_tensor(surface.faces)
-        weakest, h = Weakest(uv, faces).to(DEVICE), made().to(DEVICE)
+        weakest, h = FoldBarrier(uv, faces).to(DEVICE), made().to(DEVICE)
         planar = lambda x, h=h: h(x)[:, :2]  # noqa: E731
 
         def fifty(data: Any = data, weakest: Any = weakest, planar: Any = planar) -> None:

@@ -44,7 +44,7 @@ LATE = 1.15  # the first step's end after a mark stands for it when it is no lat
 # What trials change: the settings that were the default when the first were made, spelt out by
 # group, so that a trial means the same whatever the default has become.
 BASE: dict[str, list[str]] = {
-    "start": ["start=random"],
+    "start": ["initialization=random"],
     "domain": ["domain=disc"],
     "surface": ["surface.parameterization=slim"],
     "map": [
@@ -52,8 +52,8 @@ BASE: dict[str, list[str]] = {
         "map.width=64",
         "map.depth=1",
         "map.block=plain",
-        "map.initialisation=kaiming",
-        "map.readout=none",
+        "map.initialization=kaiming",
+        "map.linear_skip=none",
     ],
     "activation": ["activation=softplus", "activation.beta=10"],
     "encoding": [
@@ -63,7 +63,7 @@ BASE: dict[str, list[str]] = {
         "encoding.degree=2",
         "encoding.extent=1.05",
     ],
-    "lambda": ["lambda=overfit", "energy.lambda_normal=0.01"],
+    "lambda": ["loss_weights=overfit", "energy.lambda_normal=0.01"],
     "sampler": [
         "sampler=fresh_with_vertices",
         "data.vertex_share=0.1",
@@ -83,7 +83,7 @@ BASE: dict[str, list[str]] = {
 }
 
 # the start by least squares, and small rates from there
-START = ["map.readout=fitted", "encoding.resolutions=[32,128,512]"]
+START = ["map.linear_skip=fitted", "encoding.resolutions=[32,128,512]"]
 FITTED = [*START, "scheduler.peak=0.003"]
 
 LBFGS = ["optimizer=lbfgs", "scheduler.warmup=0"]
@@ -132,21 +132,21 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "hash grid, 8 levels to 512": ["encoding=hash_grid"],
     },
     "least squares": {
-        "read-out of features": ["map.readout=linear"],
-        "fitted": ["map.readout=fitted"],
+        "read-out of features": ["map.linear_skip=linear"],
+        "fitted": ["map.linear_skip=fitted"],
         "fitted, rates 1e-4": [
-            "map.readout=fitted",
+            "map.linear_skip=fitted",
             "optimizer.lr=1e-4",
             "optimizer.encoding_lr=1e-4",
         ],
         "fitted, rates 1e-3, 1e-4": [
-            "map.readout=fitted",
+            "map.linear_skip=fitted",
             "optimizer.lr=1e-3",
             "optimizer.encoding_lr=1e-4",
         ],
-        # what became the default, start=fitted
+        # what became the default, initialization=fitted
         "fitted, grid 32, 128, 512": FITTED,
-        "fitted, Fourier, 64": ["map.readout=fitted", "encoding=fourier"],
+        "fitted, Fourier, 64": ["map.linear_skip=fitted", "encoding=fourier"],
     },
     "second order": {
         "Gauss–Newton": GAUSS_NEWTON,
@@ -219,7 +219,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "cosine, no warmup": ["scheduler.warmup=0"],
     },
     "loss": {
-        "no normals": ["lambda=positions"],
+        "no normals": ["loss_weights=positions"],
         "λ_n = 0.001": ["energy.lambda_normal=0.001"],
     },
 }

@@ -13,7 +13,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
-from nsm.reference import Group, Setting, groups, ungrouped  # noqa: E402
+from nsm.config_docs import Group, Setting, groups, ungrouped  # noqa: E402
 
 FIRST = ("tutorial.md", "extending.md")
 REFERENCE = ("settings.md", "api.md")

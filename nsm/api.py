@@ -11,9 +11,8 @@ from omegaconf import DictConfig
 
 from nsm.config import compose_config
 from nsm.errors import NsmError, of_disk
-from nsm.folders import passing_folder
 from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
-from nsm.pipeline.alone import alone
+from nsm.pipeline.folder_lock import folder_lock
 from nsm.results import (
     NeuralSurface,
     Parameterization,
@@ -24,6 +23,7 @@ from nsm.results import (
     load_surface,
     load_surface_map,
 )
+from nsm.run_directories import passing_folder
 from nsm.surfaces import Surface
 from nsm.sweeps import is_complete
 
@@ -221,7 +221,7 @@ def _place(
     try:
         if folder is not None:
             config = compose_config(words)
-            with alone(Path(folder)):
+            with folder_lock(Path(folder)):
                 yield config, Path(folder)
             return
         with passing_folder() as temporary:

@@ -19,8 +19,8 @@ from omegaconf.errors import OmegaConfBaseException
 from nsm.arguments import Arguments
 from nsm.config import checked, conf_folder, one_line, register_resolvers
 from nsm.errors import NsmError, of_disk
-from nsm.folders import remove_empty
 from nsm.plugins import import_plugins
+from nsm.run_directories import remove_empty
 from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad

@@ -51,7 +51,7 @@ class SeamSchema:
 
 
 @dataclass
-class GuaranteeSchema:
+class CertificationSchema:
     repair: bool = MISSING
     rounds: int = MISSING
 
@@ -67,8 +67,8 @@ class MapSchema:
     width: int = MISSING
     depth: int = MISSING
     block: str = MISSING
-    initialisation: str = MISSING
-    readout: str = "none"
+    initialization: str = MISSING
+    linear_skip: str = "none"
 
 
 @dataclass
@@ -118,7 +118,7 @@ class Schema:
     landmarks: Any = None
     attributes: AttributesSchema = field(default_factory=AttributesSchema)
     seam: SeamSchema = field(default_factory=SeamSchema)
-    guarantee: GuaranteeSchema = field(default_factory=GuaranteeSchema)
+    certification: CertificationSchema = field(default_factory=CertificationSchema)
     map: MapSchema = field(default_factory=MapSchema)
     activation: dict[str, Any] = MISSING
     encoding: dict[str, Any] = MISSING
@@ -149,7 +149,7 @@ _LEAST = {
     "trainer.stop_gradient_norm": 0,
     "trainer.stop_window": 1,
     "trainer.gradient_clip": 0,
-    "guarantee.rounds": 0,
+    "certification.rounds": 0,
     "logger.every": 1,
     "logger.pictures": 0,
     "seed": 0,
@@ -255,7 +255,9 @@ def checked(config: DictConfig) -> DictConfig:
             raise NsmError(f"setting data.{key}: {typed.data[key]} is not in [0, 1]")
     if typed.data.vertex_share + typed.data.domain_share > 1:
         raise NsmError("setting data.domain_share: with data.vertex_share it is more than 1")
-    from nsm.choices import check_choices  # torch takes seconds; mistakes above need not wait
+    from nsm.config_validation import (
+        check_choices,  # torch takes seconds; mistakes above need not wait
+    )
 
     check_choices(typed)
     if typed.phi.overrides:
@@ -412,7 +414,7 @@ def _unknown(key: str, overrides: Sequence[str]) -> str:
 
 def known_keys() -> list[str]:
     """Names of all groups and settings, dotted."""
-    from nsm.reference import groups, ungrouped
+    from nsm.config_docs import groups, ungrouped
 
     known = {setting.key for setting in ungrouped()}
     for group in groups():

@@ -91,7 +91,7 @@ def register_encoding(name: str, kind: Callable[..., Encoding]) -> None:
     settings = {p.name: p.default for p in given if p.default is not inspect.Parameter.empty}
     _add("encoding", name, ENCODINGS, kind)
     # as for those of conf/: what has no grid to fit is trained from a random start
-    start = {"override /start@_global_.start": "random"}
+    start = {"override /initialization@_global_.initialization": "random"}
     _offer("encoding", name, {"defaults": [start, "_self_"], "name": name, **settings})
 
 

@@ -11,8 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from nsm.config import known_keys
+from nsm.config_docs import Group, Setting, groups, ungrouped
 from nsm.errors import NsmError
-from nsm.reference import Group, Setting, groups, ungrouped
 
 _USAGE = """\
 Neural surface maps: meshes as networks, and maps between them.

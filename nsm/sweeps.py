@@ -29,7 +29,7 @@ class Job:
 
     @property
     def call(self) -> tuple[dict[str, Any], str, str]:
-        """The arguments of :func:`nsm.pipeline.jobs.run_job`."""
+        """The arguments of :func:`nsm.pipeline.sweep_jobs.run_job`."""
         return self.settings, str(self.folder.absolute()), os.getcwd()
 
 

@@ -46,8 +46,8 @@ def batch_of(surface, count, dtype=torch.float64):
 @pytest.fixture
 def network():
     torch.manual_seed(0)
-    network = NeuralMap(**MAP, readout="linear").double()
-    torch.nn.init.normal_(network.readout.weight)
+    network = NeuralMap(**MAP, linear_skip="linear").double()
+    torch.nn.init.normal_(network.linear_skip.weight)
     return network
 
 
@@ -189,7 +189,12 @@ def test_only_matrices_are_preconditioned(kind):
     "words",
     [
         ["candidate=gauss_newton", "optimizer.lr=1", "candidate.iterations=2"],
-        ["candidate=gauss_newton", "optimizer.lr=1", "map.readout=fitted", "candidate.damping=1"],
+        [
+            "candidate=gauss_newton",
+            "optimizer.lr=1",
+            "map.linear_skip=fitted",
+            "candidate.damping=1",
+        ],
         ["optimizer=muon", "candidate=preconditioned", "candidate.kind=soap"],
         ["candidate=by_error"],
         ["candidate=growing_batch", "candidate.first=64", "candidate.last=256"],

@@ -5,8 +5,8 @@ import inspect
 import pytest
 import torch
 
-from nsm.choices import TASK_CHOICES, named
 from nsm.config import compose_config, conf_folder, known_keys
+from nsm.config_validation import TASK_CHOICES, named
 from nsm.errors import NsmError
 from nsm.pipeline import TASKS
 from nsm.surfaces import catalogue_names
@@ -20,7 +20,7 @@ FILES = sorted(
 FOR_TASK = {
     "energy": lambda name: "overfit" if name == "overfit" else "param",
     "constraints": lambda name: "param" if name == "param" else "pair_map",
-    "lambda": lambda name: {"param": "param"}.get(
+    "loss_weights": lambda name: {"param": "param"}.get(
         name, "pair_map" if "pair" in name else "overfit"
     ),
     "experiment": lambda name: "pair_map" if name == "paper_pair" else "overfit",
@@ -29,7 +29,7 @@ FOR_TASK = {
 
 @pytest.mark.parametrize(("group", "name"), FILES)
 def test_every_file_composes(group, name, monkeypatch):
-    monkeypatch.setattr("nsm.choices.require", lambda kind: None)  # packages of loggers
+    monkeypatch.setattr("nsm.config_validation.require", lambda kind: None)  # packages of loggers
     task = FOR_TASK.get(group, lambda name: "overfit")(name)
     words = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
     config = compose_config(words)
@@ -62,36 +62,36 @@ def test_the_check_leaves_no_trace_in_the_random_numbers():
 
 
 def test_groups_can_be_changed_apart():
-    config = compose_config(["task=pair_map", "data=paper", "lambda=paper_pair"])
+    config = compose_config(["task=pair_map", "data=paper", "loss_weights=paper_pair"])
     assert (config.data.batch_size, config.data.pool) == (4000, 500_000)
     assert config.constraints.boundary == "exact"
     assert config.constraints.lambda_seam == 0
     config = compose_config(["task=pair_map", "data=paper", "sampler=fresh", "domain=square"])
     assert (config.data.batch_size, config.data.pool, config.domain) == (4000, None, "square")
-    config = compose_config(["task=pair_map", "constraints=paper_pair", "lambda=pair"])
+    config = compose_config(["task=pair_map", "constraints=paper_pair", "loss_weights=pair"])
     assert (config.constraints.boundary, config.constraints.lambda_seam) == ("penalty", 1e3)
 
 
 @pytest.mark.parametrize(
-    ("words", "readout", "steps"),
+    ("words", "linear_skip", "steps"),
     [
         ([], "fitted", 1000),
         (["map=residual"], "fitted", 1000),
-        (["start=random"], "none", 8000),
+        (["initialization=random"], "none", 8000),
         (["encoding=fourier"], "none", 8000),
         (["encoding=identity"], "none", 8000),
-        (["encoding=fourier", "start=fitted"], "fitted", 1000),
+        (["encoding=fourier", "initialization=fitted"], "fitted", 1000),
         (["experiment=paper"], "none", 50_000),
         (["sweep=activation"], "none", 8000),
         (["task=param"], "none", 2000),
         (["task=pair_map", "encoding=fourier"], "none", 1500),
     ],
 )
-def test_only_what_can_be_fitted_starts_so(words, readout, steps):
+def test_only_what_can_be_fitted_starts_so(words, linear_skip, steps):
     """What has no grid to fit, or no surface, starts at random, at full rates."""
     config = compose_config(words)
-    assert (config.map.readout, config.trainer.max_steps) == (readout, steps)
-    assert config.scheduler.get("peak", 1.0) == (0.003 if readout == "fitted" else 1.0)
+    assert (config.map.linear_skip, config.trainer.max_steps) == (linear_skip, steps)
+    assert config.scheduler.get("peak", 1.0) == (0.003 if linear_skip == "fitted" else 1.0)
 
 
 def test_the_surface_group_is_the_catalogue():
@@ -104,7 +104,7 @@ def test_the_surface_group_is_the_catalogue():
 def test_paper_settings_are_those_of_the_paper():
     config = compose_config(["experiment=paper"])
     assert (config.map.width, config.map.depth, config.map.block) == (256, 10, "post")
-    assert config.map.initialisation == "xavier"
+    assert config.map.initialization == "xavier"
     assert dict(config.activation) == {"name": "softplus", "beta": 1.0}
     assert config.encoding.name == "identity"
     assert config.energy.lambda_normal == 0.01
@@ -124,7 +124,7 @@ def test_paper_settings_are_those_of_the_paper():
         ("activation=sillu", "'silu'"),
         ("surface=bunnny", "'bunny'"),
         ("domain=squre", "'square'"),
-        ("lambda=positons", "'positions'"),
+        ("loss_weights=positons", "'positions'"),
         ("trainer.max_steps=many", "trainer.max_steps"),
         ("trainer.accelerator=gppu", "'gpu'"),
         ("data.batch_size=0", "data.batch_size"),
@@ -171,7 +171,7 @@ def test_paper_settings_are_those_of_the_paper():
         ("task=param constraints.boundary=fixd", "'fixed'"),
         ("task=pair_map constraints.ramp=3", "constraints.ramp"),
         ("task=pair_map constraints.multiplier_every=often", "not a whole number"),
-        ("task=pair_map lambda=param", "constraints.lambda_boundary"),
+        ("task=pair_map loss_weights=param", "constraints.lambda_boundary"),
         ("+optimizer.lr=1", "leave out the +"),
     ],
 )

@@ -13,8 +13,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import nsm
 from nsm.config import conf_folder
+from nsm.config_docs import groups
 from nsm.maps import build_analytic
-from nsm.reference import groups
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -63,8 +63,8 @@ def test_jacobians_and_their_gradients(page, part):
 
 
 def test_an_encoding_of_ones_own_starts_at_random(page):
-    assert compose_config(["encoding=waves"]).map.readout == "none"
-    assert compose_config(["encoding=waves", "start=fitted"]).map.readout == "fitted"
+    assert compose_config(["encoding=waves"]).map.linear_skip == "none"
+    assert compose_config(["encoding=waves", "initialization=fitted"]).map.linear_skip == "fitted"
 
 
 def test_analytic_jacobian(page):

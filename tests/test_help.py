@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from nsm.config import compose_config, conf_folder
-from nsm.reference import groups, ungrouped
+from nsm.config_docs import groups, ungrouped
 
 FILES = [file for file in sorted(conf_folder().rglob("*.yaml")) if file.parent != conf_folder()]
 
@@ -39,7 +39,7 @@ def test_it_reads_what_yaml_reads():
     trainer = next(group for group in groups() if group.name == "trainer").options[0]
     config = compose_config().trainer
     assert {s.key for s in trainer.settings} == {f"trainer.{key}" for key in config}
-    config = compose_config(["start=random"]).trainer
+    config = compose_config(["initialization=random"]).trainer
     for setting in trainer.settings:
         assert yaml.safe_load(setting.value) == config[setting.key.split(".")[1]]
 
@@ -66,7 +66,7 @@ def test_help_on_a_group_tells_its_settings(here):
     [
         ("landmarks", "landmarks=null"),
         ("source=a.obj", "source=null"),
-        ("guarantee", "guarantee.rounds=2"),
+        ("certification", "certification.rounds=2"),
         ("trainer.max_steps", "experiment=paper"),
     ],
 )

@@ -198,7 +198,7 @@ def test_what_is_mended_is_certified(seed):
         Parameterization(NEURAL[0], planar(), correction=correction),
         SurfaceCollection(NEURAL, TRIO.maps, TRIO.landmarks, corrections={(0, 1): correction}),
     ):
-        better = broken.mended()
+        better = broken.repaired()
         assert better.certificate["certified"]
         assert better.certificate["flipped_triangles"] == 0
 
@@ -221,7 +221,16 @@ def same_map(a: torch.nn.Module, b: torch.nn.Module) -> None:
 
 def same_surface(a: NeuralSurface, b: NeuralSurface) -> None:
     same_map(a.map, b.map)
-    arrays = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "twins", "center", "scale")
+    arrays = (
+        "vertices",
+        "faces",
+        "uv",
+        "source_vertex",
+        "cut_vertex",
+        "seam_pairs",
+        "center",
+        "scale",
+    )
     for name in arrays:
         assert np.array_equal(getattr(a.surface, name), getattr(b.surface, name))
     assert (a.surface.name, a.surface.domain) == (b.surface.name, b.surface.domain)
@@ -554,7 +563,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "NeuralSurface.save": [test_what_is_saved_is_what_is_loaded],
     "NsmError": [test_errors_are_one_line],
     "Parameterization.__call__": [test_functions_of_the_domain],
-    "Parameterization.mended": [test_what_is_mended_is_certified],
+    "Parameterization.repaired": [test_what_is_mended_is_certified],
     "Parameterization.save": [test_what_is_saved_is_what_is_loaded],
     "Surface.from_arrays": [test_surfaces_of_any_arrays, test_surfaces_of_any_few_triangles],
     "Surface.from_cut": [test_surfaces_of_any_few_triangles],
@@ -566,7 +575,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "Surface.preimages": [test_seams_preimages_and_choices],
     "SurfaceCollection.__len__": [test_pairs_of_a_collection],
     "SurfaceCollection.pair": [test_pairs_of_a_collection],
-    "SurfaceCollection.mended": [test_what_is_mended_is_certified],
+    "SurfaceCollection.repaired": [test_what_is_mended_is_certified],
     "SurfaceCollection.save": [test_what_is_saved_is_what_is_loaded],
     "SurfaceMap.__call__": [test_functions_of_space],
     "SurfaceMap.planar": [
@@ -576,7 +585,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "SurfaceMap.transfer": [test_transfer],
     "SurfaceMap.morph": [test_morph],
     "SurfaceMap.aligned": [test_functions_of_space],
-    "SurfaceMap.mended": [test_what_is_mended_is_certified],
+    "SurfaceMap.repaired": [test_what_is_mended_is_certified],
     "SurfaceMap.save": [test_what_is_saved_is_what_is_loaded],
     "catalogue_names": [test_only_names_of_the_catalogue_are_meshes_of_it],
     "load": [test_what_is_saved_is_what_is_loaded, test_a_changed_byte_is_told_or_does_no_harm],

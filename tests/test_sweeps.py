@@ -72,7 +72,7 @@ def test_what_an_interruption_left_is_gone_on_with(tmp_path, here):
 
 
 def test_jobs_in_one_batch(tmp_path, here):
-    result = here("-m", *TINY, "hydra/launcher=together", "seed=0,1")
+    result = here("-m", *TINY, "hydra/launcher=batched", "seed=0,1")
     assert result.returncode == 0, result.stderr
     assert "next, 2 in one batch: seed=0; seed=1" in result.stdout
     assert "2 jobs" in result.stdout and "2 complete" in result.stdout

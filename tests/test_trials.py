@@ -14,7 +14,7 @@ from candidates import parted  # noqa: E402
 
 EVERY = {key: changes for trials in steps.TRIALS.values() for key, changes in trials.items()}
 OTHER_DEFAULT = [
-    "map.readout=linear",
+    "map.linear_skip=linear",
     "map.width=128",
     "encoding.resolutions=[32,128,512]",
     "optimizer.lr=1e-4",
@@ -35,7 +35,7 @@ def test_the_base_is_in_force_whatever_the_default():
     [
         ("fitted, Fourier, 64", "encoding", {"name": "fourier", "features": 64, "sigma": 2.0}),
         ("no normals", "energy", {"lambda_normal": 0.0}),
-        ("grid of degree 3", "map.readout", "none"),
+        ("grid of degree 3", "map.linear_skip", "none"),
     ],
 )
 def test_a_change_takes_the_place_of_the_base(trial, key, value):
@@ -55,5 +55,5 @@ def test_every_result_is_of_a_trial():
 @pytest.mark.parametrize("key", list(steps.TRIALS["from the fitted start"]))
 def test_trials_from_the_fitted_start_have_its_grid(key):
     config = compose_config(parted(steps.in_full(EVERY[key]))[0])
-    assert config.map.readout == "fitted"
+    assert config.map.linear_skip == "fitted"
     assert list(config.encoding.resolutions) == [32, 128, 512]

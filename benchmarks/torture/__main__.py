@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import nsm.pipeline  # noqa: F401  imported once, for all processes
 from nsm import cli
-from nsm.pipeline.alone import LOCK_FILE
+from nsm.pipeline.folder_lock import LOCK_FILE
 from torture import check
 from torture.cases import BARE, OVERFIT, Case, all_cases, limits, may_mount
 from torture.shapes import REFUSED, SOLVED

@@ -16,7 +16,7 @@ from PIL import Image
 from safetensors.numpy import load_file
 
 import nsm
-from nsm.pipeline.alone import LOCK_FILE
+from nsm.pipeline.folder_lock import LOCK_FILE
 
 # φ after the few steps of a trial may be this far from the mesh, in percent of the diagonal (RMS)
 NEAR_PERCENT = 15.0

@@ -20,7 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nsm.errors import NsmError
-from nsm.extras import needed
+from nsm.optional_dependencies import needed
 from nsm.sweeps import OUTCOMES, Job, Outcome, is_complete, job_folder, swept_keys
 
 _KILLED = "its process was killed, perhaps for want of memory"
@@ -90,7 +90,7 @@ class Serial(SweepLauncher):
     """One job after the other in this process."""
 
     def run(self, jobs: list[Job]) -> Iterator[Finished]:
-        from nsm.pipeline.jobs import run_job
+        from nsm.pipeline.sweep_jobs import run_job
 
         for job in jobs:
             self._say(f"next: {' '.join(job.words) or job.folder.name}")
@@ -109,8 +109,8 @@ class Together(SweepLauncher):
         self.at_once = at_once
 
     def run(self, jobs: list[Job]) -> Iterator[Finished]:
-        from nsm.pipeline.jobs import run_job
-        from nsm.pipeline.together import batches, run_together
+        from nsm.pipeline.batched import batches, run_batched
+        from nsm.pipeline.sweep_jobs import run_job
 
         if self.at_once < 1:
             raise NsmError("setting hydra.launcher.at_once: it is at least 1")
@@ -122,7 +122,7 @@ class Together(SweepLauncher):
                 yield batch[0], run_job(*batch[0].call, log=False)
                 continue
             self._say(f"next, {len(batch)} in one batch: {'; '.join(names)}")
-            for number, error in run_together([job.call for job in batch]):
+            for number, error in run_batched([job.call for job in batch]):
                 yield batch[number], error
 
 
@@ -215,7 +215,7 @@ class Resumable:
     """A job as submitit runs it; one that is cut off by time goes on where it was."""
 
     def __call__(self, settings: dict[str, Any], folder: str, cwd: str) -> str | None:
-        from nsm.pipeline.jobs import run_job
+        from nsm.pipeline.sweep_jobs import run_job
 
         return run_job(settings, folder, cwd, log=True)
 
@@ -268,7 +268,7 @@ _RAY = {"include_dashboard": False, "log_to_driver": False, "logging_level": "wa
 
 def _told(place: Path, settings: dict[str, Any], folder: str, cwd: str) -> tuple[Path, str | None]:
     """Run a job in a process of its own, and say which it was."""
-    from nsm.pipeline.jobs import run_job
+    from nsm.pipeline.sweep_jobs import run_job
 
     return place, run_job(settings, folder, cwd, log=True)
 

@@ -18,7 +18,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from nsm.errors import NsmError
-from nsm.extras import needed
+from nsm.optional_dependencies import needed
 from nsm.sweeps import Outcome, overrides_of
 
 _SAMPLERS = {

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from nsm.arguments import Arguments
-from nsm.extras import needed
+from nsm.optional_dependencies import needed
 
 
 def main(words: list[str]) -> None:

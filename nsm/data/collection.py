@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from nsm.data.overfit import HELD_OUT_SEED, Steps
-from nsm.data.parts import Part
 from nsm.data.sampling import SurfaceSampler
+from nsm.data.shard import Shard
 from nsm.surfaces import Surface
 
 
@@ -49,11 +49,11 @@ class CollectionData(pl.LightningDataModule):
         self.held_share = max(1, held_out // len(surfaces))
         self.steps_per_epoch, self.seed = steps_per_epoch, seed
         self.shares = {"vertex_share": vertex_share, "domain_share": domain_share}
-        self.part = Part()
+        self.part = Shard()
 
     def setup(self, stage: str | None = None) -> None:
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
-        self.part = Part.of(self.trainer)
+        self.part = Shard.of(self.trainer)
         self.samplers = [SurfaceSampler(surface, device) for surface in self.surfaces]
         self.turns = self.turns.to(device)
 

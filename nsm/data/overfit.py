@@ -9,8 +9,8 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader, IterableDataset
 
-from nsm.data.parts import Part
 from nsm.data.sampling import Samples, SurfaceSampler
+from nsm.data.shard import Shard
 from nsm.surfaces import Surface
 
 # Held-out points come from their own stream, whatever the training's seed.
@@ -75,11 +75,11 @@ class OverfitData(pl.LightningDataModule):
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.vertex_share, self.domain_share, self.pool_size = vertex_share, domain_share, pool
         self.held_out, self.seed = held_out, seed
-        self.part = Part()
+        self.part = Shard()
 
     def setup(self, stage: str | None = None) -> None:
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
-        self.part = Part.of(self.trainer)
+        self.part = Shard.of(self.trainer)
         self.sampler = SurfaceSampler(self.surface, device)
         self.pool = (
             self.sampler.pool(self.pool_size, self.sampler.generator(self.seed, -1))
@@ -116,7 +116,7 @@ class OverfitData(pl.LightningDataModule):
         return DataLoader(self.held_out_batches(), batch_size=None)  # type: ignore[arg-type]
 
 
-class SeveralData(pl.LightningDataModule):
+class EnsembleData(pl.LightningDataModule):
     """The samples that :class:`OverfitData` has of each of k surfaces: Samples of (k, N, ...).
 
     Args:

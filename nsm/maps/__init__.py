@@ -2,12 +2,12 @@
 
 from nsm.maps.activations import ACTIVATIONS, Activation
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Formula, build_analytic
+from nsm.maps.batched_maps import batched
 from nsm.maps.composition import Composition, PointMap, Rotated
 from nsm.maps.encodings import ENCODINGS, Encoding, RandomFourierFeatures, SplineGrid
-from nsm.maps.inverse import Between, inverted
+from nsm.maps.inverse import TransitionMap, inverted
 from nsm.maps.networks import BLOCKS, NeuralMap, build_map
 from nsm.maps.planar import DiscMap, Planar, PlanarMap, SquareMap, build_planar
-from nsm.maps.together import together
 
 __all__ = [
     "ACTIVATIONS",
@@ -15,7 +15,7 @@ __all__ = [
     "BLOCKS",
     "ENCODINGS",
     "Activation",
-    "Between",
+    "TransitionMap",
     "AnalyticSurface",
     "Composition",
     "DiscMap",
@@ -33,5 +33,5 @@ __all__ = [
     "build_map",
     "build_planar",
     "inverted",
-    "together",
+    "batched",
 ]

@@ -164,11 +164,11 @@ class Activation(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         return self.formulas.value_and_slope(z, **self.parameters_)[0]
 
-    def push_(self, z: Tensor, keep: bool) -> tuple[Tensor, ...]:
+    def jvp_(self, z: Tensor, keep: bool) -> tuple[Tensor, ...]:
         """Turn a stack z (P, n, d) of value and tangents into that of f, in place.
 
         Returns:
-            What ``pull_`` needs beside the result, if ``keep``: nothing, or f′ and f″ times the
+            What ``vjp_`` needs beside the result, if ``keep``: nothing, or f′ and f″ times the
             tangents.
         """
         kept: tuple[Tensor, ...] = ()
@@ -180,12 +180,12 @@ class Activation(nn.Module):
         z[1:].mul_(slope)
         return kept
 
-    def pull_(self, gradient: Tensor, result: Tensor, kept: tuple[Tensor, ...]) -> None:
+    def vjp_(self, gradient: Tensor, result: Tensor, kept: tuple[Tensor, ...]) -> None:
         """Turn the gradient (P, n, d) by f's stack into that by z's, in place.
 
         Args:
             gradient: of the loss by ``result``.
-            result: what ``push_`` made.
+            result: what ``jvp_`` made.
             kept: what it returned.
         """
         if kept:

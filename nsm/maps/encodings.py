@@ -273,7 +273,7 @@ class SplineGrid(nn.Module):
         return self._blended(x, rows, orders, list(self.tables))
 
     @classmethod
-    def stacks_together(cls, grids: Sequence[SplineGrid], x: Tensor) -> Tensor:
+    def batched_stacks(cls, grids: Sequence[SplineGrid], x: Tensor) -> Tensor:
         """What k grids, alike but for their features, have of k sets of points (k, N, 2) each:
         values and both tangents, stacked: (k, 3, N, out_dim)."""
         first, points = grids[0], x.flatten(0, 1)

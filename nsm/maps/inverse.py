@@ -60,7 +60,7 @@ def _kept(x: Tensor, onto: str | None) -> Tensor:
     return x.clamp(-1, 1) if onto == "square" else x
 
 
-class Between(nn.Module):
+class TransitionMap(nn.Module):
     """h_j∘h_i⁻¹: from the domain of one surface of a collection to that of another.
 
     Args:

@@ -16,7 +16,7 @@ from nsm.maps.encodings import (
     pushed_forward,
     value_and_jacobian_stack,
 )
-from nsm.maps.trunk import Trunk
+from nsm.maps.mlp_with_tangents import MLPWithTangents
 
 
 class PostActivationBlock(nn.Module):
@@ -60,13 +60,13 @@ BLOCKS: dict[str, Callable[[int, Activation], nn.Module]] = {
     "post": PostActivationBlock,
     "pre": PreActivationBlock,
 }
-# what every second layer adds (see :class:`nsm.maps.trunk.Trunk`); others than these blocks have
-# no written-out backward pass
+# what every second layer adds (see :class:`nsm.maps.mlp_with_tangents.MLPWithTangents`); other
+# blocks have no written-out backward pass
 SKIPS = {"plain": None, "post": "post", "pre": "pre"}
-INITIALISATIONS = ("xavier", "kaiming", "siren")
+INITIALIZATIONS = ("xavier", "kaiming", "siren")
 # what the features of a point add to the output past the network: nothing, or a linear function;
 # fitted: one that starts as the surface's best (see :mod:`nsm.tasks.least_squares`)
-READOUTS = ("none", "linear", "fitted")
+LINEAR_SKIPS = ("none", "linear", "fitted")
 
 
 class NeuralMap(nn.Module):
@@ -79,8 +79,8 @@ class NeuralMap(nn.Module):
             registered.
         activation: ``{"name": ..., parameters}``; see :mod:`nsm.maps.activations`.
         encoding: ``{"name": ..., parameters}``; see :mod:`nsm.maps.encodings`.
-        initialisation: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
-        readout: ``none``; ``linear``: a linear function of the encoding's features, zero at the
+        initialization: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
+        linear_skip: ``none``; ``linear``: a linear function of the encoding's features, zero at the
             start, is added to the output; ``fitted``: the same, for a task that fits it.
     """
 
@@ -92,8 +92,8 @@ class NeuralMap(nn.Module):
         block: str = "pre",
         activation: dict[str, Any] | None = None,
         encoding: dict[str, Any] | None = None,
-        initialisation: str = "kaiming",
-        readout: str = "none",
+        initialization: str = "kaiming",
+        linear_skip: str = "none",
     ) -> None:
         super().__init__()
         activation = dict(activation or {"name": "softplus"})
@@ -105,17 +105,17 @@ class NeuralMap(nn.Module):
             "block": block,
             "activation": dict(activation),
             "encoding": dict(encoding),
-            "initialisation": initialisation,
-            "readout": readout,
+            "initialization": initialization,
+            "linear_skip": linear_skip,
         }
         if block not in BLOCKS:
             raise ValueError(f"block {block!r} is not one of {', '.join(BLOCKS)}")
-        if initialisation not in INITIALISATIONS:
+        if initialization not in INITIALIZATIONS:
             raise ValueError(
-                f"initialisation {initialisation!r} is not one of {', '.join(INITIALISATIONS)}"
+                f"initialization {initialization!r} is not one of {', '.join(INITIALIZATIONS)}"
             )
-        if readout not in READOUTS:
-            raise ValueError(f"readout {readout!r} is not one of {', '.join(READOUTS)}")
+        if linear_skip not in LINEAR_SKIPS:
+            raise ValueError(f"linear_skip {linear_skip!r} is not one of {', '.join(LINEAR_SKIPS)}")
         name = encoding.pop("name")
         if name not in ENCODINGS:
             raise ValueError(f"encoding {name!r} is not one of {', '.join(ENCODINGS)}")
@@ -124,16 +124,16 @@ class NeuralMap(nn.Module):
         self.input = nn.Linear(self.encoding.out_dim, width)
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
         self.output = nn.Linear(width, out_dim)
-        self.readout: nn.Linear | None = None
-        if readout != "none":
-            self.readout = nn.Linear(self.encoding.out_dim, out_dim)
-            nn.init.zeros_(self.readout.weight)
-            nn.init.zeros_(self.readout.bias)
+        self.linear_skip: nn.Linear | None = None
+        if linear_skip != "none":
+            self.linear_skip = nn.Linear(self.encoding.out_dim, out_dim)
+            nn.init.zeros_(self.linear_skip.weight)
+            nn.init.zeros_(self.linear_skip.bias)
         modules = (self.input, *self.blocks.modules(), self.output)
         self.layers = [m for m in modules if isinstance(m, nn.Linear)]
-        self._initialise(initialisation)
+        self._initialize(initialization)
 
-    def _initialise(self, how: str) -> None:
+    def _initialize(self, how: str) -> None:
         omega = float(self.activation.parameters_.get("omega", 1.0))
         for module in self.layers:
             if how == "xavier":
@@ -158,7 +158,7 @@ class NeuralMap(nn.Module):
         """(N, 2) points of Ω to (N, out_dim)."""
         features = self.encoding(x)
         y = self._after(features)
-        return y if self.readout is None else y + self.readout(features)
+        return y if self.linear_skip is None else y + self.linear_skip(features)
 
     def _after(self, features: Tensor) -> Tensor:
         """What comes after the encoding."""
@@ -175,7 +175,7 @@ class NeuralMap(nn.Module):
         """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
         s = features = value_and_jacobian_stack(self.encoding, x)
         if self.config["block"] in SKIPS:
-            s = Trunk.apply(
+            s = MLPWithTangents.apply(
                 s,
                 self.activation,
                 SKIPS[self.config["block"]],
@@ -184,12 +184,12 @@ class NeuralMap(nn.Module):
             )
         else:
             s = pushed_forward(self._after, s)
-        if self.readout is not None:
-            s = read_out(s, features, self.readout.weight, self.readout.bias)
+        if self.linear_skip is not None:
+            s = add_linear_skip(s, features, self.linear_skip.weight, self.linear_skip.bias)
         return s[0], s[1:].permute(1, 2, 0)
 
 
-def read_out(stack: Tensor, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def add_linear_skip(stack: Tensor, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """A linear function of features, with its tangents, added to a stack.
 
     Args:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from nsm.maps.networks import NeuralMap
 
 
-class FromIdentity(nn.Module):
+class IdentityInitializedMap(nn.Module):
     """A map made of a network whose output layer is zero at the start."""
 
     out_dim: int
@@ -23,7 +23,7 @@ class FromIdentity(nn.Module):
         nn.init.zeros_(self.network.output.bias)
 
     @classmethod
-    def around(cls, network: nn.Module) -> FromIdentity:
+    def around(cls, network: nn.Module) -> IdentityInitializedMap:
         """The map of a network that is there, which also may be several in one batch."""
         made = cls.__new__(cls)
         nn.Module.__init__(made)
@@ -36,7 +36,7 @@ class FromIdentity(nn.Module):
         return {**self.network.config, "onto": self.onto}
 
 
-class PlanarMap(FromIdentity):
+class PlanarMap(IdentityInitializedMap):
     """h(x) = x + N(x), with a network N whose output layer is zero at the start.
 
     Args:
@@ -55,7 +55,7 @@ class PlanarMap(FromIdentity):
         return x + value, torch.eye(2, dtype=x.dtype, device=x.device) + jacobian
 
 
-class DiscMap(FromIdentity):
+class DiscMap(IdentityInitializedMap):
     """h(x) = R(θ(x))·(x + (1 − ‖x‖²)·N(x)): the circle goes to itself, whatever N and θ are.
 
     The boundary constraint (METHOD, B) holds by construction, and the image of ∂Ω slides by θ.
@@ -89,7 +89,7 @@ class DiscMap(FromIdentity):
         return _turned(y, c, s), torch.stack(columns, dim=-1)
 
 
-class SquareMap(FromIdentity):
+class SquareMap(IdentityInitializedMap):
     """h_i(x) = x_i + (1 − x_i²)·N_i(x): each side of the square goes to itself, corners stay.
 
     Args:

@@ -9,9 +9,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nsm.errors import NsmError
-from nsm.pipeline.alone import alone
 from nsm.pipeline.collection_map import run_collection_map
 from nsm.pipeline.common import quiet_lightning, stored_config
+from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.overfit import build_overfit, run_overfit
 from nsm.pipeline.pair_map import run_pair_map
 from nsm.pipeline.param import run_param
@@ -45,7 +45,7 @@ def run(config: DictConfig, folder: Path) -> None:
     Raises:
         NsmError: bad input of any kind, or another process at work in the folder.
     """
-    with alone(folder):
+    with folder_lock(folder):
         run_held(config, folder)
 
 

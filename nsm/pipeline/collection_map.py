@@ -15,10 +15,10 @@ from rich.console import Console
 
 from nsm.data import CollectionData
 from nsm.errors import NsmError
+from nsm.pipeline.certification import certified
 from nsm.pipeline.common import built, fitted, frozen, plain, say_where, with_map, write_figures
-from nsm.pipeline.guarantee import guaranteed
-from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.pipeline.pair_map import absolute_paths
+from nsm.pipeline.resolve_inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.results import (
     NeuralSurface,
     SurfaceCollection,
@@ -33,10 +33,10 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.results.metrics import evaluate
+from nsm.surfaces.joint_preparation import Matched, matched_landmarks
 from nsm.surfaces.shapes import grid_mesh, ring_mesh
-from nsm.surfaces.together import Matched, matched_landmarks
 from nsm.tasks import CollectionMap
-from nsm.tasks.start import landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
 _SEAM_POINTS = 24  # on each branch
 _RINGS = 80  # of an even mesh of the common domain
@@ -55,9 +55,9 @@ def run_collection_map(
     Args:
         config: as :func:`nsm.config.compose_config` gives it, with ``task=collection_map``.
         folder: the run folder.
-        surfaces: three or more, as :func:`nsm.pipeline.inputs.read_shape` takes them; those of
-            the configuration by default.
-        landmarks: as :func:`nsm.pipeline.inputs.landmark_vertices` takes them.
+        surfaces: three or more, as :func:`nsm.pipeline.resolve_inputs.read_shape` takes them;
+            those of the configuration by default.
+        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
         resuming: go on from the folder's checkpoint.
 
     Raises:
@@ -102,7 +102,7 @@ def run_collection_map(
         maps = [frozen(h) for h in module.map]
         return SurfaceCollection(phis, maps, np.stack(ids, axis=1), {}, settings)
 
-    result, certificate = guaranteed(config, trainer, module, made, console)
+    result, certificate = certified(config, trainer, module, made, console)
     result.metrics.update(collection_metrics(result, points, matched.points))
     result.save(folder)
     if config.artefacts:
@@ -160,7 +160,7 @@ def build_collection_map(
     parts = [*(phi.surface.faces for phi in phis), even_faces]
     faces = np.concatenate([part + n for part, n in zip(parts, first, strict=True)])
     mesh = (torch.cat(vertices), torch.as_tensor(faces))
-    cut = all(len(phi.surface.twins) for phi in phis) and matched.on_boundary >= 2
+    cut = all(len(phi.surface.seam_pairs) for phi in phis) and matched.on_boundary >= 2
     common = Matched([points.double().numpy()], matched.numbers, matched.on_boundary)
     seam = common.seam(config.domain, _SEAM_POINTS) if cut else np.zeros((0, 2, 2))
     module = built(

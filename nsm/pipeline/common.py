@@ -24,19 +24,19 @@ from torch.multiprocessing.spawn import ProcessRaisedException
 from nsm.config import PRECISIONS, checked, read_config
 from nsm.data import OverfitData
 from nsm.errors import NsmError
-from nsm.folders import is_passing
 from nsm.pipeline.processes import Process, shared_steps, take_over, told_by
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
-from nsm.results.faults import Faults, faults_of
+from nsm.results.divergence_guard import DivergenceGuard, guard_of
 from nsm.results.files import as_json, check_stored
 from nsm.results.loggers import Distributed, build_loggers, close, log_figures, loggers_of
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
+from nsm.run_directories import is_passing
 from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.tasks.compiling import Compiled
-from nsm.tasks.several import Several
+from nsm.tasks.ensemble import Ensemble
 
 CONFIG_FILE = "config.yaml"
 CHECKPOINT_FILE = "last.ckpt"
@@ -191,7 +191,7 @@ class Run:
             return 0, 1
         try:
             state = stored_state(self.checkpoint)
-            if state["callbacks"]["Faults"]["rollbacks"]:
+            if state["callbacks"]["DivergenceGuard"]["rollbacks"]:
                 return None
             stage = state["global_step"], int(state["nsm_parts"])
         except (NsmError, KeyError, TypeError, ValueError):
@@ -219,7 +219,7 @@ def trained(
     """Train a module in its run folder, or that of several trainings in one batch, each in its own.
 
     Args:
-        runs: one, or those of a :class:`nsm.tasks.several.Several`, whose checkpoints are of one
+        runs: one, or those of a :class:`nsm.tasks.ensemble.Several`, whose checkpoints are of one
             step; their settings are the same in what concerns the training as a whole.
         data, module, console: the samples, what is trained, and where to print.
         pictures: for the logs, if any.
@@ -227,13 +227,13 @@ def trained(
 
     Raises:
         KeyboardInterrupt: the user stops it.
-        Parted: several trainings cannot go on in one batch.
+        EnsembleSplit: several trainings cannot go on in one batch.
     """
     config, folder = runs[0].config, runs[0].folder
     settings = config.trainer
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
-    faults = Faults(console)
+    faults = DivergenceGuard(console)
     callbacks: list[Callback] = [
         faults,
         GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window),
@@ -280,7 +280,7 @@ def trained(
     states = [stored_state(run.checkpoint) for run in runs if run.checkpoint]
     first_step = states[0]["global_step"] if states else 0
     checkpoint = runs[0].checkpoint if first_step else None
-    if isinstance(module, Several):
+    if isinstance(module, Ensemble):
         module.stored = states
     del states
 
@@ -385,7 +385,7 @@ def write_figures(
         "steps": trainer.global_step,
         "seconds": round(time.monotonic() - started, 2),
         "preparation": surface.quality,
-        "faults": faults_of(trainer),
+        "faults": guard_of(trainer),
         **figures,
     }
     atomic_write(folder / "metrics.json", as_json(words))

@@ -12,7 +12,7 @@ import pytorch_lightning as pl
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.data import SeveralData
+from nsm.data import EnsembleData
 from nsm.maps.networks import SKIPS
 from nsm.pipeline.common import (
     Run,
@@ -40,10 +40,10 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.surfaces import Surface
-from nsm.tasks import Overfit, OverfitSeveral
-from nsm.tasks.least_squares import fit_readout
+from nsm.tasks import Overfit, OverfitEnsemble
+from nsm.tasks.ensemble import Ensemble
+from nsm.tasks.least_squares import fit_linear_skip
 from nsm.tasks.optimizers import shared_options
-from nsm.tasks.several import Several
 
 
 def run_overfit(
@@ -124,8 +124,8 @@ def leave_results(
     if config.artefacts:
         _write_artefacts(folder, neural)
     figures: dict[str, Any] = {"metrics": neural.metrics}
-    if isinstance(trainer.lightning_module, Several):
-        figures["together"] = len(trainer.lightning_module.each)
+    if isinstance(trainer.lightning_module, Ensemble):
+        figures["batched"] = len(trainer.lightning_module.each)
     write_figures(config, folder, surface, trainer, started, figures, index)
     console.print(metrics_table(neural.metrics))
     say_where(console, folder)
@@ -160,7 +160,7 @@ def common_settings(settings: Mapping[str, Any]) -> dict[str, Any] | None:
     return {**rest, "energy": energy, "optimizer": optimizer}
 
 
-def overfit_together(
+def overfit_ensemble(
     runs: Sequence[Run], surfaces: Sequence[Surface], console: Console
 ) -> tuple[list[Overfit], pl.Trainer]:
     """Train several networks in one batch, each in its run folder, as each would be alone.
@@ -175,7 +175,7 @@ def overfit_together(
 
     Raises:
         NsmError: settings that do not fit together.
-        Parted: some have to be trained alone; all have whole checkpoints, if any.
+        EnsembleSplit: some have to be trained alone; all have whole checkpoints, if any.
     """
     config = runs[0].config
     modules: list[Overfit] = []
@@ -188,8 +188,8 @@ def overfit_together(
     seeds = [run.config.seed for run in runs]
     trainer = trained(
         runs,
-        SeveralData(surfaces, seeds, **plain(config)["data"]),
-        OverfitSeveral(modules),
+        EnsembleData(surfaces, seeds, **plain(config)["data"]),
+        OverfitEnsemble(modules),
         console,
         _pictures(config, lambda module: surface_of[module]),
         f"overfit {len(runs)} networks",
@@ -205,7 +205,7 @@ def _pictures(config: DictConfig, surface_of: Callable[[Any], Surface]) -> Pictu
 
 
 def build_overfit(config: DictConfig, surface: Surface, start: Overfit | None = None) -> Overfit:
-    """The overfit task's module, seeded, and fitted where ``map.readout`` says so.
+    """The overfit task's module, seeded, and fitted where ``map.linear_skip`` says so.
 
     Args:
         config, surface: of the run.
@@ -224,8 +224,8 @@ def build_overfit(config: DictConfig, surface: Surface, start: Overfit | None = 
         )
         if start is not None:
             module.load_state_dict(start.state_dict())
-        elif config.map.readout == "fitted":
-            fit_readout(module.map, surface, seed=config.seed)
+        elif config.map.linear_skip == "fitted":
+            fit_linear_skip(module.map, surface, seed=config.seed)
         return module
 
     return built(config, make)

@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.certification import certified
 from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
-from nsm.pipeline.guarantee import guaranteed
-from nsm.pipeline.inputs import landmark_vertices, neural_surfaces, read_shape, vertex_count
+from nsm.pipeline.resolve_inputs import landmark_vertices, neural_surfaces, read_shape, vertex_count
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
@@ -33,9 +33,9 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.results.metrics import evaluate
-from nsm.surfaces.together import Matched, matched_landmarks
+from nsm.surfaces.joint_preparation import Matched, matched_landmarks
 from nsm.tasks import PairMap
-from nsm.tasks.start import landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
 _MORPH_FRAMES = 9
 
@@ -54,9 +54,9 @@ def run_pair_map(
     Args:
         config: as :func:`nsm.config.compose_config` gives it, with ``task=pair_map``.
         folder: the run folder.
-        source, target: surfaces as :func:`nsm.pipeline.inputs.read_shape` takes them; those of
-            the configuration by default.
-        landmarks: as :func:`nsm.pipeline.inputs.landmark_vertices` takes them.
+        source, target: surfaces as :func:`nsm.pipeline.resolve_inputs.read_shape` takes them;
+            those of the configuration by default.
+        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
         resuming: go on from the folder's checkpoint.
 
     Raises:
@@ -97,7 +97,7 @@ def run_pair_map(
     def made() -> SurfaceMap:
         return SurfaceMap(phi, psi, frozen(module.map), np.stack(ids, axis=1), {}, settings)
 
-    result, certificate = guaranteed(config, trainer, module, made, console)
+    result, certificate = certified(config, trainer, module, made, console)
     landed = result.planar(points) if len(points) else points
     result.metrics.update(pair_metrics(phi.surface, psi.surface, result.image_uv, landed, targets))
     result.metrics.update(result.certificate)
@@ -133,11 +133,11 @@ def build_pair_map(
     """
     surface = phi.surface
     # where the seams correspond, both sides of the source's should go to one curve
-    alike = len(psi.surface.twins) and matched.on_boundary >= 2
-    twins = surface.twins if alike else surface.twins[:0]
+    alike = len(psi.surface.seam_pairs) and matched.on_boundary >= 2
+    seam_pairs = surface.seam_pairs if alike else surface.seam_pairs[:0]
     p, q, uv, seam = (
         torch.as_tensor(array, dtype=torch.float32)
-        for array in (*matched.points, surface.uv, surface.uv[twins])
+        for array in (*matched.points, surface.uv, surface.uv[seam_pairs])
     )
     if len(p):
         turn = landmark_rotation(config.domain, p, q)

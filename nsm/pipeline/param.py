@@ -11,9 +11,9 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
+from nsm.pipeline.certification import certified
 from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
-from nsm.pipeline.guarantee import guaranteed
-from nsm.pipeline.neural import neural_surface
+from nsm.pipeline.surface_cache import neural_surface
 from nsm.results import (
     NeuralSurface,
     Parameterization,
@@ -67,7 +67,7 @@ def run_param(
     def made() -> Parameterization:
         return Parameterization(phi, frozen(module.map), {}, plain(config))
 
-    result, certificate = guaranteed(config, trainer, module, made, console)
+    result, certificate = certified(config, trainer, module, made, console)
     maps = {"domain": surface.uv, "nsm": result.uv}
     for name, method in BASELINES.items():
         try:

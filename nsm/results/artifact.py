@@ -23,7 +23,7 @@ FORMAT = "nsm-surface"
 VERSION = 1
 STEM = "surface"
 _MOST_VERTICES = 200_000_000  # of a mesh file
-_ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "twins", "center")
+_ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ def _check_shapes(surface: Surface) -> None:
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
     for name in _ARRAYS:
-        whole = name in ("faces", "source_vertex", "cut_vertex", "twins")
+        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
         if getattr(surface, name).dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} is not of its type")
     if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
@@ -186,7 +186,7 @@ def _check_shapes(surface: Surface) -> None:
         raise ValueError("a vertex that the mesh file does not have")
     if cut.min() < -1 or not 0 <= cut.max() < count:
         raise ValueError("a vertex of the file that became none of these")
-    for name, columns in (("faces", 3), ("twins", 2)):
+    for name, columns in (("faces", 3), ("seam_pairs", 2)):
         index = getattr(surface, name)
         if index.ndim != 2 or index.shape[1] != columns:
             raise ValueError(f"{name} has not {columns} columns")

@@ -17,7 +17,7 @@ from torch.optim import Optimizer
 from nsm.errors import NsmError
 from nsm.results.files import flush_folder
 from nsm.results.loggers import log_picture, loggers_of
-from nsm.tasks.several import Several, apart
+from nsm.tasks.ensemble import Ensemble, members
 
 
 class AtomicCheckpoint(Callback):
@@ -39,7 +39,7 @@ class AtomicCheckpoint(Callback):
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         for index, path in enumerate(self.paths):
-            if isinstance(pl_module, Several):
+            if isinstance(pl_module, Ensemble):
                 pl_module.shown = index
             self._save(trainer, path)
 
@@ -82,9 +82,9 @@ class GradientWatch(Callback):
         logging = (trainer.global_step + 1) % self.every == 0  # the steps that Lightning keeps
         if not logging and self.stop_norm is None:
             return
-        for end, module in apart(pl_module).items():
+        for end, module in members(pl_module).items():
             gradients = [p.grad for p in module.parameters() if p.grad is not None]
-            if not gradients:  # taken back, as not finite (see Faults)
+            if not gradients:  # taken back, as not finite (see DivergenceGuard)
                 return
             norm = float(torch.nn.utils.get_total_norm(gradients))
             self.recent.append(norm)
@@ -134,7 +134,7 @@ class Pictures(Callback):
         if due <= self.taken:
             return
         self.taken = due
-        for index, module in enumerate(apart(pl_module).values()):
+        for index, module in enumerate(members(pl_module).values()):
             picture = self.draw(module)  # type: ignore[arg-type]
             log_picture(loggers_of(trainer.loggers, index), self.name, picture, trainer.global_step)
 

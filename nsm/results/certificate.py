@@ -42,7 +42,7 @@ def certificate(uv: np.ndarray, faces: np.ndarray, *, onto: bool) -> dict[str, A
     return {"certified": turned == 0 and wrong == 0, "flipped_triangles": turned, name: wrong}
 
 
-def together(certificates: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def combined(certificates: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """One certificate for several maps: all must hold, and counts add up."""
     listed = list(certificates)
     total: dict[str, Any] = {"certified": all(c["certified"] for c in listed)}
@@ -59,7 +59,7 @@ def verdict(found: dict[str, Any]) -> str:
     return f"{start}: {', '.join(counts)}"
 
 
-def mended(surface: Surface, image: np.ndarray, *, held: np.ndarray, onto: bool) -> np.ndarray:
+def repaired(surface: Surface, image: np.ndarray, *, held: np.ndarray, onto: bool) -> np.ndarray:
     """The image of a surface's vertices with flips turned back, where that can be done.
 
     Args:

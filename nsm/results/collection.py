@@ -13,9 +13,9 @@ import torch
 from torch import nn
 
 from nsm.errors import NsmError
-from nsm.maps import Between
+from nsm.maps import TransitionMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
-from nsm.results.certificate import Correction, together
+from nsm.results.certificate import Correction, combined
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
@@ -41,7 +41,7 @@ class SurfaceCollection:
         landmarks: (L, k) vertices of the mesh files.
         metrics: figures of :func:`collection_metrics`.
         config: the settings of the run that made it.
-        corrections: of the pairs (source, target) that :meth:`mended` had to mend.
+        corrections: of the pairs (source, target) that :meth:`repaired` had to mend.
     """
 
     surfaces: list[NeuralSurface]
@@ -72,11 +72,11 @@ class SurfaceCollection:
     @property
     def certificate(self) -> dict[str, Any]:
         """Whether the maps of all ordered pairs are injective (see :func:`certificate`)."""
-        return together(self.pair(*ends).certificate for ends in self._ordered)
+        return combined(self.pair(*ends).certificate for ends in self._ordered)
 
-    def mended(self) -> SurfaceCollection:
-        """The collection with :meth:`SurfaceMap.mended` maps."""
-        made = {ends: self.pair(*ends).mended() for ends in self._ordered}
+    def repaired(self) -> SurfaceCollection:
+        """The collection with :meth:`SurfaceMap.repaired` maps."""
+        made = {ends: self.pair(*ends).repaired() for ends in self._ordered}
         corrections = {ends: f.correction for ends, f in made.items() if len(f.correction.vertices)}
         return replace(self, corrections=corrections, _made=made)
 
@@ -91,7 +91,7 @@ class SurfaceCollection:
         turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
         nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
         onto = first.inner.config.get("onto")  # type: ignore[union-attr, operator]
-        h = Between(_double(first), _double(self.maps[target]), nodes, onto)
+        h = TransitionMap(_double(first), _double(self.maps[target]), nodes, onto)
         ids = self.landmarks[:, [source, target]]
         ends = self.surfaces[source], self.surfaces[target]
         correction = self.corrections.get((source, target), Correction())

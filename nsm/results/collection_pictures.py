@@ -59,6 +59,6 @@ def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> 
             t = target.surface
             uv = source.surface.uv if i == j else collection.pair(i, j).source_uv
             title = f"{source.surface.name} → {t.name}" if i != j else t.name
-            row.append((views[j].draw(t.vertices, t.faces, checked(uv), t.twins), title))
+            row.append((views[j].draw(t.vertices, t.faces, checked(uv), t.seam_pairs), title))
         rows.append(row)
     save_figure(panels(*rows), path)

@@ -226,7 +226,7 @@ def _compare(folder: Path, flat: dict[str, Any], figures: dict[str, float], step
 def headline(metrics: Mapping[str, Any]) -> dict[str, float]:
     """A run's figures as one row.
 
-    Those of a parameterisation are its own, without the methods it is compared with; those of a
+    Those of a parameterization are its own, without the methods it is compared with; those of a
     collection are the worst over its pairs.
     """
     row = {k: float(v) for k, v in metrics.items() if isinstance(v, (int, float))}

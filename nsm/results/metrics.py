@@ -81,7 +81,7 @@ def overfit_metrics(
     there = point_mesh_distance(points, image, fine_faces)
     some = image[:: len(image) // MOST_POINTS + 1]
     back = point_mesh_distance(some, surface.vertices, surface.faces)
-    seam = surface.uv[surface.twins.ravel()]
+    seam = surface.uv[surface.seam_pairs.ravel()]
     gap = np.zeros(1)
     if len(seam):
         pairs = evaluate(phi, seam).reshape(-1, 2, 3)

@@ -98,7 +98,7 @@ def pair_metrics(
     distance = signed_distance(source.domain, torch.from_numpy(image_uv)).numpy()
     loop = boundary_loops(source.faces)[0]
     error = np.linalg.norm(lifted(landmark_image) - lifted(landmark_target), axis=1)
-    gap = np.linalg.norm(image[source.twins[:, 0]] - image[source.twins[:, 1]], axis=1)
+    gap = np.linalg.norm(image[source.seam_pairs[:, 0]] - image[source.seam_pairs[:, 1]], axis=1)
     figures["flipped_percent"] = 100 * float(flipped.mean())
     figures["outside_percent"] = 100 * float((distance > ON_BOUNDARY).mean())
     figures["boundary_distance_max"] = float(np.abs(distance[loop]).max())

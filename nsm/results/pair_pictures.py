@@ -38,10 +38,10 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
 
     def at_source(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        return left.draw(s.vertices, s.faces, paint, s.twins)
+        return left.draw(s.vertices, s.faces, paint, s.seam_pairs)
 
     def at_target(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        return right.draw(target, t.faces, paint, t.twins)
+        return right.draw(target, t.faces, paint, t.seam_pairs)
 
     rows = [
         [
@@ -74,8 +74,11 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     other = View(image, PANEL, frame=view.frame)
     figure = panels(
         [
-            (view.draw(s.vertices, s.faces, paint, s.twins), f"{s.name}: symmetric Dirichlet"),
-            (other.draw(image, s.faces, paint, s.twins), f"its image on {f.target.surface.name}"),
+            (view.draw(s.vertices, s.faces, paint, s.seam_pairs), f"{s.name}: symmetric Dirichlet"),
+            (
+                other.draw(image, s.faces, paint, s.seam_pairs),
+                f"its image on {f.target.surface.name}",
+            ),
             (np.ones((PANEL, PANEL, 3)), ""),
         ]
     )
@@ -102,7 +105,7 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
 
     def draw(t: float, size: int) -> np.ndarray:
         view = View(both, size, frame=frame)
-        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv), s.twins)).astype(
+        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv), s.seam_pairs)).astype(
             np.uint8
         )
 

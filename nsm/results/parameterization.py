@@ -1,4 +1,4 @@
-"""Parameterisations: planar maps of neural surfaces."""
+"""Parameterizations: planar maps of neural surfaces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from nsm.maps import Planar, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
-from nsm.results.certificate import Correction, certificate, mended
+from nsm.results.certificate import Correction, certificate, repaired
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
@@ -33,7 +33,7 @@ class Parameterization:
         metrics: figures of :func:`nsm.results.planar_metrics` by method: ``nsm`` (with its
             certificate), the start (``domain``), and those of libigl on the same mesh.
         config: the settings of the run that made it.
-        correction: vertices that :meth:`mended` moved off h, and where to.
+        correction: vertices that :meth:`repaired` moved off h, and where to.
     """
 
     phi: NeuralSurface
@@ -66,11 +66,11 @@ class Parameterization:
     def _onto(self) -> bool:
         return self.map.onto is not None
 
-    def mended(self) -> Parameterization:
+    def repaired(self) -> Parameterization:
         """The map with its flipped triangles turned back, where that can be done."""
         surface = self.phi.surface
         nothing = np.zeros(len(surface.uv), dtype=bool)
-        better = mended(surface, self.uv, held=nothing, onto=self._onto)
+        better = repaired(surface, self.uv, held=nothing, onto=self._onto)
         return replace(self, correction=Correction.between(self.uv, better, self.correction))
 
     def save(self, folder: str | Path) -> None:

@@ -35,10 +35,13 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     error = vertex_error(surface, neural.map)
     scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
     view = View(surface.vertices, PANEL)
-    source = view.draw(surface.vertices, surface.faces, _grey, surface.twins)
+    source = view.draw(surface.vertices, surface.faces, _grey, surface.seam_pairs)
     colours = scale.to_rgba(error)[:, :3]
     image = view.draw(
-        evaluate(neural.map, surface.uv), surface.faces, lambda blend: blend(colours), surface.twins
+        evaluate(neural.map, surface.uv),
+        surface.faces,
+        lambda blend: blend(colours),
+        surface.seam_pairs,
     )
     rms = neural.metrics.get("rms_percent")
     title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
@@ -95,7 +98,7 @@ def parameterization_picture(
     """
     view = View(surface.vertices, PANEL)
     above = [
-        (view.draw(surface.vertices, surface.faces, checked(uv), surface.twins), name)
+        (view.draw(surface.vertices, surface.faces, checked(uv), surface.seam_pairs), name)
         for name, uv in maps.items()
     ]
     below = [(layout_image(surface, uv, size=PANEL), "") for uv in maps.values()]

@@ -125,7 +125,7 @@ class View:
         vertices: np.ndarray,
         faces: np.ndarray,
         colours: Callable[[Blend], np.ndarray],
-        twins: np.ndarray | None = None,
+        seam_pairs: np.ndarray | None = None,
     ) -> np.ndarray:
         """A shaded picture (size, size, 3) in [0, 1] on white.
 
@@ -133,7 +133,7 @@ class View:
             vertices, faces: the mesh (V, 3), (F, 3).
             colours: gives the colours (P, 3) in [0, 1] of the pixels, from a function that
                 interpolates vertex values (V, k) to them, (P, k).
-            twins: (T, 2) vertices that were one before the mesh was cut: no crease shows there.
+            seam_pairs: (T, 2) vertices that were one before the cut: no crease shows there.
         """
         fine = self.size * _SUPERSAMPLING
         turned = vertices @ self.frame.T
@@ -146,7 +146,7 @@ class View:
             return (weights[:, :, None] * values[corners]).sum(axis=1)
 
         base = colours(blend)
-        normal = blend(vertex_normals(turned, faces, twins))
+        normal = blend(vertex_normals(turned, faces, seam_pairs))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
         facing = np.where(normal[:, 2:] < 0, -normal, normal)
         lit = 0.38 + 0.62 * np.clip(facing @ _LIGHT, 0, 1)
@@ -158,16 +158,18 @@ class View:
 
 
 def vertex_normals(
-    vertices: np.ndarray, faces: np.ndarray, twins: np.ndarray | None = None
+    vertices: np.ndarray, faces: np.ndarray, seam_pairs: np.ndarray | None = None
 ) -> np.ndarray:
     """Unit normals (V, 3) of a mesh (V, 3), (F, 3), weighted by area; zero where there is none.
 
-    Vertices that were one before the mesh was cut, ``twins`` (T, 2), have one normal.
+    Vertices that were one before the mesh was cut, ``seam_pairs`` (T, 2), have one normal.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     point = np.arange(len(vertices))
-    if twins is not None:
-        links = coo_matrix((np.ones(len(twins)), tuple(twins.T)), shape=(len(point), len(point)))
+    if seam_pairs is not None:
+        links = coo_matrix(
+            (np.ones(len(seam_pairs)), tuple(seam_pairs.T)), shape=(len(point), len(point))
+        )
         point = connected_components(links, directed=False)[1]
     total = np.zeros_like(vertices)
     np.add.at(total, point[faces].ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))

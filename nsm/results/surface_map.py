@@ -16,7 +16,7 @@ from torch import nn
 from nsm.errors import NsmError
 from nsm.maps import Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
-from nsm.results.certificate import Correction, certificate, mended
+from nsm.results.certificate import Correction, certificate, repaired
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
@@ -43,7 +43,7 @@ class SurfaceMap:
         landmarks: (L, 2) vertices of the two mesh files.
         metrics: figures of :func:`nsm.results.pair_metrics`.
         config: the settings of the run that made it.
-        correction: vertices of the source that :meth:`mended` moved off h, and where to.
+        correction: vertices of the source that :meth:`repaired` moved off h, and where to.
     """
 
     source: NeuralSurface
@@ -89,12 +89,12 @@ class SurfaceMap:
         """Whether the map to the target's domain is injective (see :func:`certificate`)."""
         return certificate(self.image_uv, self.source.surface.faces, onto=True)
 
-    def mended(self) -> SurfaceMap:
+    def repaired(self) -> SurfaceMap:
         """The map with its flipped triangles turned back, and its boundary put in order, where
         that can be done; landmarks stay if that suffices. Figures are to be measured anew."""
         s = self.source.surface
         held = np.isin(s.source_vertex, s.kept(self.landmarks[:, 0].tolist()))
-        better = mended(s, self.image_uv, held=held, onto=True)
+        better = repaired(s, self.image_uv, held=held, onto=True)
         result = replace(
             self, correction=Correction.between(self.image_uv, better, self.correction)
         )

@@ -48,7 +48,7 @@ def normal_variation(
         surface more wrinkled than its source, below 0 one that smooths the source's detail over.
     """
     start, end = _ways(surface, distance * surface.bounding_box_diagonal, samples, seed)
-    smooth = vertex_normals(surface.vertices, surface.faces, surface.twins)
+    smooth = vertex_normals(surface.vertices, surface.faces, surface.seam_pairs)
     smooth[~smooth.any(axis=1)] = np.nan
     there, mesh = [], []
     for places in (start, end):

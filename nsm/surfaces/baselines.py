@@ -1,4 +1,4 @@
-"""Parameterisations of libigl on the same cut mesh, for comparison side by side."""
+"""Parameterizations of libigl on the same cut mesh, for comparison side by side."""
 
 from __future__ import annotations
 

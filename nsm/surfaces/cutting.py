@@ -28,12 +28,12 @@ SMALL_BOUNDARY = 1.2
 @dataclass(frozen=True)
 class Cut:
     """A disc: vertices (V,3), faces (F,3), origin (V,) index before the cut or -1 for inserted
-    points, twins (T,2) pairs of cut vertices that were one, loop (B,) the boundary, log."""
+    points, seam_pairs (T,2) pairs of cut vertices that were one, loop (B,) the boundary, log."""
 
     vertices: np.ndarray
     faces: np.ndarray
     origin: np.ndarray
-    twins: np.ndarray
+    seam_pairs: np.ndarray
     loop: np.ndarray
     log: tuple[str, ...]
 

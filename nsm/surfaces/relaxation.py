@@ -118,7 +118,7 @@ class Slopes:
     """Where vertices may move: freely, or, those of a mask (V,), along ∂Ω; some not at all."""
 
     def __init__(self, rim: np.ndarray, held: np.ndarray, domain: str) -> None:
-        self.rim, self.held, self.domain = rim, held, domain
+        self.boundary, self.held, self.domain = rim, held, domain
 
     def tangent(self, uv: np.ndarray) -> np.ndarray:
         if self.domain == "disc":
@@ -139,7 +139,7 @@ class Slopes:
 def relax(uv: np.ndarray, stars: Stars, slopes: Slopes) -> None:
     """One Newton step of each of the stars' vertices, within uv (V, 2)."""
     energy, gradient, second = stars.derivatives(uv)
-    rim, here = slopes.rim[stars.vertex], uv[stars.vertex]
+    rim, here = slopes.boundary[stars.vertex], uv[stars.vertex]
     direction = _newton(gradient, second)
     if rim.any():
         t, g, h = slopes.tangent(here[rim]), gradient[rim], second[rim]

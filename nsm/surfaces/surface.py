@@ -38,7 +38,7 @@ class Surface:
         source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
         cut_vertex: (W,) int64, of each vertex of the mesh file the first vertex here that it, or
             the one that it was merged with, became; or -1 if it is not on the surface.
-        twins: (T, 2) int64, pairs of vertices on the seam that were one point.
+        seam_pairs: (T, 2) int64, pairs of vertices on the seam that were one point.
         scale, center: ``vertices = (original - center) * scale``.
         quality: figures of the preparation (see :meth:`from_arrays`).
         log: what was repaired, converted or cut, a line each.
@@ -51,7 +51,7 @@ class Surface:
     domain: str
     source_vertex: np.ndarray = field(repr=False)
     cut_vertex: np.ndarray = field(repr=False)
-    twins: np.ndarray = field(repr=False)
+    seam_pairs: np.ndarray = field(repr=False)
     scale: float = field(repr=False)
     center: np.ndarray = field(repr=False)
     quality: dict[str, float] = field(default_factory=dict, repr=False)
@@ -205,7 +205,7 @@ class Surface:
         crossings = boundary_self_intersections(flat.uv, cut.loop)
         if flipped or crossings:
             raise NsmError(
-                f"{name}: the parameterisation is not injective ({flipped} flipped triangles, "
+                f"{name}: the parameterization is not injective ({flipped} flipped triangles, "
                 f"{crossings} boundary crossings); give seam_vertices at the tips of long parts"
             )
         source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
@@ -215,7 +215,7 @@ class Surface:
             "boundary_self_intersections": float(crossings),
             "median_symmetric_dirichlet": flat.distortion,
             "tutte_median_symmetric_dirichlet": flat.tutte_distortion,
-            "seam_vertices": float(len(cut.twins)),
+            "seam_vertices": float(len(cut.seam_pairs)),
             "seconds": time.perf_counter() - start,
         }
         return cls(
@@ -226,7 +226,7 @@ class Surface:
             domain=domain,
             source_vertex=source,
             cut_vertex=np.where(mesh.merged >= 0, first[mesh.merged], -1),
-            twins=cut.twins,
+            seam_pairs=cut.seam_pairs,
             scale=scale,
             center=center,
             quality=quality,
@@ -242,7 +242,7 @@ class Surface:
             "uv": self.uv,
             "source_vertex": self.source_vertex,
             "cut_vertex": self.cut_vertex,
-            "twins": self.twins,
+            "seam_pairs": self.seam_pairs,
             "center": self.center,
             "words": np.frombuffer(words.encode(), dtype=np.uint8),
         }
@@ -259,7 +259,7 @@ class Surface:
             domain=domain,
             source_vertex=stored["source_vertex"],
             cut_vertex=stored["cut_vertex"],
-            twins=stored["twins"],
+            seam_pairs=stored["seam_pairs"],
             scale=words["scale"],
             center=stored["center"],
             quality=words["quality"],
@@ -272,7 +272,7 @@ class Surface:
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
     def content_key(self) -> str:
-        """Hash of the geometry and its parameterisation: equal surfaces, equal keys."""
+        """Hash of the geometry and its parameterization: equal surfaces, equal keys."""
         digest = hashlib.sha256(self.domain.encode())
         for array in (self.vertices, self.uv):
             digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
@@ -313,7 +313,7 @@ def as_it_lies(
     faces: np.ndarray,
     uv: np.ndarray,
     domain: str,
-    twins: np.ndarray | None = None,
+    seam_pairs: np.ndarray | None = None,
 ) -> Surface:
     """A disc that is laid out already, in its own units and place; nothing is checked."""
     return Surface(
@@ -324,7 +324,7 @@ def as_it_lies(
         domain=domain,
         source_vertex=np.arange(len(uv)),
         cut_vertex=np.arange(len(uv)),
-        twins=np.zeros((0, 2), dtype=np.int64) if twins is None else twins,
+        seam_pairs=np.zeros((0, 2), dtype=np.int64) if seam_pairs is None else seam_pairs,
         scale=1.0,
         center=np.zeros(3),
     )

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Rotated, build_planar, together
+from nsm.maps import Rotated, batched, build_planar
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.terms import Distortion
-from nsm.tasks.weakest import Weakest
 
 
 class CollectionMap(ConstrainedMap):
@@ -60,7 +60,7 @@ class CollectionMap(ConstrainedMap):
         planar = {**map, "onto": self.constraints.onto(domain)}
         self.map = nn.ModuleList(Rotated(build_planar(planar), turn) for turn in turns)
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
-        self.weakest = nn.ModuleList(Weakest(*mesh) for _ in phis)
+        self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh) for _ in phis)
         self.hold(points, targets, points @ turns.transpose(1, 2), seam)
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
@@ -68,7 +68,7 @@ class CollectionMap(ConstrainedMap):
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (N, 2) of the common domain to those of all surfaces, (k, N, 2)."""
-        every: Tensor = together(list(self.map))(x.expand(len(self.map), -1, -1))
+        every: Tensor = batched(list(self.map))(x.expand(len(self.map), -1, -1))
         return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
@@ -77,11 +77,13 @@ class CollectionMap(ConstrainedMap):
         terms = {"injectivity": injectivity(determinant).mean(dim=1).sum()}
         if held.boundary == "penalty":
             stray = outside(self.domain, images).mean(dim=1).sum()
-            terms["boundary"] = boundary(self.domain, self(self.rim)).mean(dim=1).sum() + stray
+            terms["boundary"] = (
+                boundary(self.domain, self(self.boundary_samples)).mean(dim=1).sum() + stray
+            )
         if len(self.seam) and held.lambda_seam > 0:
             terms["seam"] = self._seam_gap()
         if held.lambda_triangles > 0:
-            both = zip(self.map, self.weakest, strict=True)
+            both = zip(self.map, self.fold_barrier, strict=True)
             terms["triangles"] = torch.stack([w(h, self.global_step) for h, w in both]).sum()
         return self.total(distortion, terms)
 
@@ -102,17 +104,15 @@ class CollectionMap(ConstrainedMap):
 
     def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A_i (N, k, 2, 2), det J_h (N, k) and h (N, k, 2) of all surfaces at points (N, 2)."""
-        images, inner = together(list(self.map)).value_and_jacobian(x.expand(len(self.map), -1, -1))
-        _, outer = together(list(self.phis)).value_and_jacobian(images)
+        images, inner = batched(list(self.map)).value_and_jacobian(x.expand(len(self.map), -1, -1))
+        _, outer = batched(list(self.phis)).value_and_jacobian(images)
         metrics = first_fundamental_form(outer @ inner)
         return tuple(part.transpose(0, 1) for part in (metrics, torch.linalg.det(inner), images))  # type: ignore[return-value]
 
     def _seam_gap(self) -> Tensor:
         """Σ over surfaces of the mean squared distance between a seam point's two copies."""
         a, b = (
-            together(list(self.phis))(self(self.seam.reshape(-1, 2)))
-            .unflatten(1, (-1, 2))
-            .unbind(2)
+            batched(list(self.phis))(self(self.seam.reshape(-1, 2))).unflatten(1, (-1, 2)).unbind(2)
         )
         return ((a - b) ** 2).sum(dim=-1).mean(dim=1).sum()
 
@@ -120,10 +120,10 @@ class CollectionMap(ConstrainedMap):
         self.log_validation(*self._distortion(batch))
 
     def flipped_percent(self) -> Tensor:
-        both = zip(self.map, self.weakest, strict=True)
+        both = zip(self.map, self.fold_barrier, strict=True)
         return torch.stack([w.flipped_percent(h) for h, w in both]).mean()  # type: ignore[operator]
 
     def landmark_error(self) -> Tensor:
-        phis = together(list(self.phis))
+        phis = batched(list(self.phis))
         units = self.targets.new_tensor(self.diagonals)[:, None]
         return 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)

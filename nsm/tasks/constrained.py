@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from nsm.energies import Blend, inside, landmark
+from nsm.tasks.boundary_samples import boundary_samples
+from nsm.tasks.fold_barrier import carefully, stronger
 from nsm.tasks.optimizers import configure
-from nsm.tasks.rim import rim
 from nsm.tasks.terms import Distortion, HeldOut, Term
 from nsm.tasks.training import Training
-from nsm.tasks.weakest import carefully, stronger
 
 BOUNDARIES = ("exact", "penalty")
 LANDMARKS = ("augmented", "fixed")
@@ -36,7 +36,7 @@ class Constraints:
             them to where they belong, and λ_seam grows from zero: pulled at once, h would fold.
         lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam, lambda_triangles: the
             weights λ_inv, λ_B, λ_C, that of the seam's gap on the target, and that of the mesh
-            triangles nearest to folding (:class:`nsm.tasks.weakest.Weakest`).
+            triangles nearest to folding (:class:`nsm.tasks.fold_barrier.FoldBarrier`).
 
     Raises:
         ValueError: a word that is not known, or a ramp outside [0, 1].
@@ -105,7 +105,7 @@ class ConstrainedMap(Training):
         """Take landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point."""
         named = {"points": points, "targets": targets, "start": start, "seam": seam}
-        for name, tensor in {**named, "rim": rim(self.domain)}.items():
+        for name, tensor in {**named, "rim": boundary_samples(self.domain)}.items():
             self.register_buffer(name, tensor, persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
 

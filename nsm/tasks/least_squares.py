@@ -45,7 +45,7 @@ _SLOPES = 1e-5
 _STREAM = -2  # of the random numbers: no step has it
 
 
-def fit_readout(network: NeuralMap, surface: Surface, *, seed: int = 0) -> None:
+def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> None:
     """Set a network's read-out, and the tables of its grid, to the best fit of a surface.
 
     The network itself starts at zero behind it. The levels of a grid are fitted in turn, each to
@@ -59,7 +59,7 @@ def fit_readout(network: NeuralMap, surface: Surface, *, seed: int = 0) -> None:
     Raises:
         ValueError: a grid of fewer features than the read-out has coordinates.
     """
-    assert network.readout is not None
+    assert network.linear_skip is not None
     encoding = network.encoding
     nn.init.zeros_(network.output.weight)
     nn.init.zeros_(network.output.bias)
@@ -74,9 +74,9 @@ def fit_readout(network: NeuralMap, surface: Surface, *, seed: int = 0) -> None:
     target = _rows(wanted, along)
     with torch.no_grad():
         if grid:
-            _fit_tables(grid, network.readout, samples.uv, along, target)
+            _fit_tables(grid, network.linear_skip, samples.uv, along, target)
         else:
-            _fit_weights(encoding, network.readout, samples.uv, along, target)
+            _fit_weights(encoding, network.linear_skip, samples.uv, along, target)
 
 
 def _along(jacobian: Tensor) -> Tensor:
@@ -97,16 +97,16 @@ def _rows(stack: Tensor, along: Tensor) -> Tensor:
 
 
 def _fit_tables(
-    grid: SplineGrid, readout: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
+    grid: SplineGrid, linear_skip: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
 ) -> None:
-    size = readout.out_features
+    size = linear_skip.out_features
     if grid.features < size:
         raise ValueError(
             f"a grid that is fitted needs {size} features or more a level; with fewer, take "
-            "start=random"
+            "initialization=random"
         )
-    nn.init.zeros_(readout.weight)
-    nn.init.zeros_(readout.bias)
+    nn.init.zeros_(linear_skip.weight)
+    nn.init.zeros_(linear_skip.bias)
     left = target.clone()
     column = grid.out_dim - grid.features * len(grid.tables)
     for level, (table, cells) in enumerate(zip(grid.tables, grid.resolutions, strict=True)):
@@ -119,7 +119,7 @@ def _fit_tables(
         # tables of entries about 1, which steps of one rate suit
         scale = float(found.square().mean().sqrt().clamp(min=1e-30))
         table[:, :size] = found / scale
-        readout.weight[:, column : column + size] = scale * torch.eye(size)
+        linear_skip.weight[:, column : column + size] = scale * torch.eye(size)
         column += grid.features
 
 
@@ -171,7 +171,7 @@ def _normal_equations(
 
 
 def _fit_weights(
-    encoding: Encoding, readout: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
+    encoding: Encoding, linear_skip: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
 ) -> None:
     """Features without tables stay as they are: the read-out's weights alone are fitted."""
     features = torch.cat([value_and_jacobian_stack(encoding, uv), torch.zeros(3, len(uv), 1)], 2)
@@ -180,5 +180,5 @@ def _fit_weights(
     normal, right = design.t() @ design, design.t() @ target.flatten(0, 1)
     normal += _RIDGE * normal.diagonal().mean() * torch.eye(len(normal))
     found = torch.linalg.solve(normal, right).t()
-    readout.weight.copy_(found[:, :-1])
-    readout.bias.copy_(found[:, -1])
+    linear_skip.weight.copy_(found[:, :-1])
+    linear_skip.bias.copy_(found[:, -1])

@@ -87,7 +87,7 @@ _WHOLE = ("lbfgs",)
 # those whose first group is of the hidden layers' matrices alone
 _BY_MATRIX = ("muon",)
 # layers that give numbers that are not features of a network
-_LAST = ("output", "readout")
+_LAST = ("output", "linear_skip")
 Factor = Callable[[float], float]  # of the step: share of the full learning rate
 
 

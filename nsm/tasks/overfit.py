@@ -10,9 +10,9 @@ from torch import Tensor
 
 from nsm.data import Samples
 from nsm.energies.overfit import normal, position
-from nsm.maps import build_map, together
+from nsm.maps import batched, build_map
+from nsm.tasks.ensemble import Ensemble
 from nsm.tasks.optimizers import configure
-from nsm.tasks.several import Several
 from nsm.tasks.terms import Term
 from nsm.tasks.training import Training
 
@@ -94,7 +94,7 @@ def _held_out(value: Tensor, jacobian: Tensor, batch: Samples) -> dict[str, Tens
     }
 
 
-class OverfitSeveral(Several):
+class OverfitEnsemble(Ensemble):
     """k surfaces at once, each as :class:`Overfit` has it, with the networks in one batch.
 
     Args:
@@ -106,7 +106,7 @@ class OverfitSeveral(Several):
 
     def __init__(self, each: Sequence[Overfit]) -> None:
         super().__init__(each)
-        self._together = (together([one.map for one in each]),)  # no module of its own
+        self._batched = (batched([one.map for one in each]),)  # no module of its own
         self.some_normals = any(one.lambda_normal != 0 for one in each)
         lambdas, units = ([getattr(o, a) for o in each] for a in ("lambda_normal", "diagonal"))
         self.register_buffer("lambda_normal", torch.tensor(lambdas), persistent=False)
@@ -124,7 +124,7 @@ class OverfitSeveral(Several):
         """Values (k, N, 3) and Jacobians (k, N, 3, 2)."""
 
         def by_point(x: Tensor) -> tuple[Tensor, ...]:
-            both = self._together[0].value_and_jacobian(x.transpose(0, 1))
+            both = self._batched[0].value_and_jacobian(x.transpose(0, 1))
             return tuple(part.transpose(0, 1) for part in both)
 
         return tuple(part.transpose(0, 1) for part in self.pointwise(by_point, uv.transpose(0, 1)))
@@ -133,7 +133,7 @@ class OverfitSeveral(Several):
         return not name.endswith("/normal") or cast(Overfit, self.each[index]).lambda_normal != 0
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        value, jacobian = self._together[0].value_and_jacobian(batch.uv)
+        value, jacobian = self._batched[0].value_and_jacobian(batch.uv)
         self.logged(_held_out(value, jacobian, batch), batch_size=value.shape[1])
 
     def on_validation_epoch_end(self) -> None:

@@ -11,8 +11,8 @@ from nsm.data import Samples
 from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import Composition, Rotated, build_planar
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.terms import Distortion
-from nsm.tasks.weakest import Weakest
 
 
 class PairMap(ConstrainedMap):
@@ -28,7 +28,7 @@ class PairMap(ConstrainedMap):
         points, targets: landmarks P (L, 2) and Q (L, 2) in the domains of source and target.
         seam: (T, 2, 2) pairs of points of ∂Ω that are one point of the source, and whose images
             should be one point of the target.
-        turn: rotation (2, 2) of h's input (see :mod:`nsm.tasks.start`).
+        turn: rotation (2, 2) of h's input (see :mod:`nsm.tasks.initial_rotation`).
         mesh: uv (V, 2) and faces (F, 3) of the source, whose triangles must not flip.
         diagonal: of the target's bounding box, the unit of the errors that are logged.
         phi, psi: source and target; neither is trained.
@@ -62,7 +62,7 @@ class PairMap(ConstrainedMap):
         self.phi = phi.eval().requires_grad_(False)
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
-        self.weakest = Weakest(*mesh)
+        self.fold_barrier = FoldBarrier(*mesh)
         self.diagonal = diagonal
         self.hold(points, targets, points @ turn.T, seam)
 
@@ -76,11 +76,13 @@ class PairMap(ConstrainedMap):
         terms = {"injectivity": injectivity(determinant).mean()}
         if held.boundary == "penalty":
             stray = outside(self.domain, image).mean()
-            terms["boundary"] = boundary(self.domain, self.map(self.rim)).mean() + stray
+            terms["boundary"] = (
+                boundary(self.domain, self.map(self.boundary_samples)).mean() + stray
+            )
         if len(self.seam) and held.lambda_seam > 0:
             terms["seam"] = self._seam_gap()
         if held.lambda_triangles > 0:
-            terms["triangles"] = self.weakest(self.map, self.global_step)
+            terms["triangles"] = self.fold_barrier(self.map, self.global_step)
         return self.total(distortion, terms)
 
     def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor, Tensor]:
@@ -109,7 +111,7 @@ class PairMap(ConstrainedMap):
         self.log_validation(*self._distortion(batch.uv))
 
     def flipped_percent(self) -> Tensor:
-        return self.weakest.flipped_percent(self.map)
+        return self.fold_barrier.flipped_percent(self.map)
 
     def landmark_error(self) -> Tensor:
         off = self.image(self.points) - self.psi(self.targets)

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from nsm.data import Samples
 from nsm.energies import Blend, first_fundamental_form, injectivity
 from nsm.maps import build_planar
+from nsm.tasks.fold_barrier import FoldBarrier, carefully, stronger
 from nsm.tasks.optimizers import configure
 from nsm.tasks.terms import Distortion, HeldOut, Term
 from nsm.tasks.training import Training
-from nsm.tasks.weakest import Weakest, carefully, stronger
 
 BOUNDARIES = ("free", "fixed")
 
@@ -21,8 +21,8 @@ BOUNDARIES = ("free", "fixed")
 class Param(Training):
     """L = mean E(A, B) + λ_inv mean G(det J_h) + λ_tri U, A = J_φᵀJ_φ, B = J_hᵀJ_h (METHOD, Param).
 
-    U keeps the mesh's triangles from folding (:class:`nsm.tasks.weakest.Weakest`). With a fixed
-    boundary h keeps to Ω by construction, and the image of ∂Ω slides on ∂Ω: a map that folds
+    U keeps the mesh's triangles from folding (:class:`nsm.tasks.fold_barrier.FoldBarrier`). With a
+    fixed boundary h keeps to Ω by construction, and the image of ∂Ω slides on ∂Ω: a map that folds
     nowhere is then bijective.
 
     Args:
@@ -64,7 +64,7 @@ class Param(Training):
         self.map = build_planar({**map, "onto": domain if boundary == "fixed" else None})
         self.phi = phi.eval().requires_grad_(False)
         self.lambda_injectivity, self.lambda_triangles = lambda_injectivity, lambda_triangles
-        self.weakest = Weakest(*mesh)
+        self.fold_barrier = FoldBarrier(*mesh)
         self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
@@ -79,7 +79,10 @@ class Param(Training):
             "injectivity": (self.lambda_injectivity, fold),
         }
         if self.lambda_triangles > 0:
-            terms["triangles"] = (self.lambda_triangles, self.weakest(self.map, self.global_step))
+            terms["triangles"] = (
+                self.lambda_triangles,
+                self.fold_barrier(self.map, self.global_step),
+            )
         self.note({"distortion": distortion.mean})
         return self.summed(terms)
 
@@ -108,7 +111,7 @@ class Param(Training):
 
     def on_validation_epoch_end(self) -> None:
         self.log("val/distortion_median", self.held_out.median())
-        self.log("val/flipped_percent", self.weakest.flipped_percent(self.map))
+        self.log("val/flipped_percent", self.fold_barrier.flipped_percent(self.map))
 
     def configure_optimizers(self) -> Any:
         return configure(self.map, self.hparams)

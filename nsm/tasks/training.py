@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 from torch import Tensor
 
 from nsm.tasks.compiling import Compiled
-from nsm.tasks.splitting import Splitting
+from nsm.tasks.microbatching import Microbatching
 from nsm.tasks.terms import Term
 
 
-class Training(Splitting):
+class Training(Microbatching):
     """Base of the tasks.
 
     Attributes:
@@ -27,7 +27,7 @@ class Training(Splitting):
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
     ) -> tuple[Tensor, ...]:
         # held-out batches have other shapes, and parts of a batch are checkpointed
-        if self.compiled is not None and self.training and self.parts == 1:
+        if self.compiled is not None and self.training and self.microbatches == 1:
             return self.compiled(function, x)
         return super().pointwise(function, x)
 

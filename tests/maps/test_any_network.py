@@ -10,10 +10,10 @@ from tiny import NETWORK, planar
 from nsm.maps import (
     ACTIVATIONS,
     BLOCKS,
-    Between,
     Composition,
     NeuralMap,
     Rotated,
+    TransitionMap,
     build_planar,
     inverted,
 )
@@ -37,7 +37,7 @@ SETTINGS = st.fixed_dictionaries(
                 {"name": "spline_grid", "resolutions": [3, 5], "features": 2},
             ]
         ),
-        "initialisation": st.sampled_from(["xavier", "kaiming", "siren"]),
+        "initialization": st.sampled_from(["xavier", "kaiming", "siren"]),
     }
 )
 
@@ -93,5 +93,5 @@ def test_an_inverse_undoes_its_map(onto, x):
         nodes = nodes[nodes.norm(dim=1) <= 1]
     second = planar(onto).double()
     # h and itself: the way there and back is none; and with another, it is that one alone
-    assert (Between(h, h, nodes, onto)(there) - there).norm(dim=1).max() < 1e-6
-    assert (Between(h, second, nodes, onto)(there) - second(x)).norm(dim=1).max() < 1e-5
+    assert (TransitionMap(h, h, nodes, onto)(there) - there).norm(dim=1).max() < 1e-6
+    assert (TransitionMap(h, second, nodes, onto)(there) - second(x)).norm(dim=1).max() < 1e-5

@@ -2,7 +2,7 @@
 
 import torch
 
-from nsm.maps import Between, build_planar, inverted
+from nsm.maps import TransitionMap, build_planar, inverted
 
 
 def stirred(seed, scale=0.15):
@@ -37,9 +37,9 @@ def test_a_point_without_preimage_is_never_farther_than_the_start():
 
 def test_between_two_maps_goes_through_the_common_domain():
     first, second, x = stirred(2), stirred(3), disc(200)
-    between = Between(first, second, disc(400, seed=1))
+    between = TransitionMap(first, second, disc(400, seed=1))
     assert (between(first(x)) - second(x)).norm(dim=1).max() < 1e-8
-    back = Between(second, first, disc(400, seed=1))
+    back = TransitionMap(second, first, disc(400, seed=1))
     assert (back(between(first(x))) - first(x)).norm(dim=1).max() < 1e-8
 
 
@@ -47,6 +47,6 @@ def test_points_of_the_rim_come_back_to_the_rim():
     h = stirred(4, scale=0.08)
     t = torch.linspace(0, 6.28, 200, dtype=torch.float64)
     rim = torch.stack([t.cos(), t.sin()], dim=1)
-    back = Between(h, h, disc(400), "disc").back(rim)
+    back = TransitionMap(h, h, disc(400), "disc").back(rim)
     assert (h(back) - rim).norm(dim=1).max() < 1e-8
     assert (back.norm(dim=1) - 1).abs().max() < 1e-6

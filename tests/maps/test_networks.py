@@ -32,14 +32,14 @@ def randomised(config: dict) -> torch.nn.Module:
     "encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}"
 )
 def test_a_read_out_adds_a_linear_function_of_the_features(encoding):
-    net = randomised({"width": 8, "depth": 1, "encoding": encoding, "readout": "linear"})
+    net = randomised({"width": 8, "depth": 1, "encoding": encoding, "linear_skip": "linear"})
     x = points()
     value, jacobian = net.value_and_jacobian(x)
     expected = torch.func.vmap(torch.func.jacfwd(lambda p: net(p[None])[0]))(x)
     torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-9)
     net.output.weight.data.zero_()
     net.output.bias.data.zero_()
-    torch.testing.assert_close(net(x), net.readout(net.encoding(x)), rtol=0, atol=1e-12)
+    torch.testing.assert_close(net(x), net.linear_skip(net.encoding(x)), rtol=0, atol=1e-12)
     assert not torch.allclose(value, net(x))
 
 
@@ -62,12 +62,12 @@ def test_agrees_with_jacfwd(block, activation, encoding):
     assert ((jacobian - expected).abs().max() / scale) < 1e-10
 
 
-@pytest.mark.parametrize("readout", ["none", "linear"])
+@pytest.mark.parametrize("linear_skip", ["none", "linear"])
 @pytest.mark.parametrize(
     "encoding", ENCODING_CONFIGS, ids=lambda e: f"{e['name']}{e.get('degree', '')}"
 )
-def test_parameter_gradient_of_a_jacobian_loss(encoding, readout):
-    net = randomised({"width": 8, "depth": 1, "encoding": encoding, "readout": readout})
+def test_parameter_gradient_of_a_jacobian_loss(encoding, linear_skip):
+    net = randomised({"width": 8, "depth": 1, "encoding": encoding, "linear_skip": linear_skip})
     x = points(6)
     loss = net.value_and_jacobian(x)[1].square().sum()
     loss.backward()
@@ -121,7 +121,7 @@ def test_siren_keeps_its_spread_with_depth():
             "depth": 6,
             "block": "plain",
             "activation": {"name": "sine"},
-            "initialisation": "siren",
+            "initialization": "siren",
         }
     )
     y = net.activation(net.input(points(2000).float()))
@@ -134,7 +134,7 @@ def test_siren_keeps_its_spread_with_depth():
     "config",
     [
         {"block": "dense"},
-        {"initialisation": "zero"},
+        {"initialization": "zero"},
         {"activation": {"name": "swishh"}},
         {"activation": {"name": "relu", "beta": 2}},
         {"encoding": {"name": "hash"}},

@@ -9,7 +9,7 @@ from nsm.errors import NsmError
 from nsm.maps import Rotated, build_planar
 from nsm.results import SurfaceMap, analytic
 from nsm.results.analytic import analytic_surface
-from nsm.results.certificate import Correction, certificate, mended, together, verdict
+from nsm.results.certificate import Correction, certificate, combined, repaired, verdict
 from nsm.surfaces.shapes import ring_mesh
 
 UV, FACES = ring_mesh(8)
@@ -53,8 +53,8 @@ def test_a_map_that_overlaps_itself_without_flips_is_not_certified():
 def test_together_all_must_hold_and_counts_add_up():
     good = {"certified": True, "flipped_triangles": 0, "boundary_order_violations": 0}
     bad = {"certified": False, "flipped_triangles": 2, "boundary_order_violations": 1}
-    assert together([good, good]) == good
-    assert together([good, bad, bad]) == {
+    assert combined([good, good]) == good
+    assert combined([good, bad, bad]) == {
         "certified": False,
         "flipped_triangles": 4,
         "boundary_order_violations": 2,
@@ -79,7 +79,7 @@ def folded():
 
 @pytest.fixture(scope="module")
 def better(folded):
-    return folded.mended()
+    return folded.repaired()
 
 
 def test_a_folding_map_is_mended_and_certified(folded, better):
@@ -145,5 +145,5 @@ def test_a_boundary_out_of_order_is_put_in_order(folded):
     order = rim[np.argsort(np.arctan2(*image[rim].T[::-1]))]
     image[order[[5, 6]]] = image[order[[6, 5]]]
     assert certificate(image, surface.faces, onto=True)["boundary_order_violations"] > 0
-    better = mended(surface, image, held=np.zeros(len(image), bool), onto=True)
+    better = repaired(surface, image, held=np.zeros(len(image), bool), onto=True)
     assert certificate(better, surface.faces, onto=True)["certified"]

@@ -20,7 +20,7 @@ from nsm.pipeline import run_overfit
 QUICK = ["experiment=quick", "data.held_out=512", "logger.every=5", "trainer.progress=false"]
 TINY = [
     *QUICK,
-    "start=random",
+    "initialization=random",
     "data.batch_size=64",
     "data.steps_per_epoch=10",
     "trainer.max_steps=20",

@@ -44,14 +44,14 @@ class Affine(nn.Module):
         return self(uv), self.frame.expand(len(uv), 3, 2)
 
 
-def square(twins=()) -> Surface:
+def square(seam_pairs=()) -> Surface:
     """[-1, 1]² in the plane z = 0, with its own coordinates as uv."""
     n = 6
     x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
     uv = np.stack([x.ravel(), y.ravel()], axis=1)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
-    pairs = np.array(twins, dtype=np.int64).reshape(-1, 2)
+    pairs = np.array(seam_pairs, dtype=np.int64).reshape(-1, 2)
     vertices = np.column_stack([uv, np.zeros(len(uv))])
     return as_it_lies("square", vertices, faces, uv, "square", pairs)
 
@@ -98,7 +98,7 @@ def test_a_collapsed_map_is_degenerate_everywhere():
 
 
 def test_the_seam_gap_is_the_distance_of_twins():
-    surface = square(twins=[(0, 5)])  # (-1, -1) and (-1, 1): 2 apart
+    surface = square(seam_pairs=[(0, 5)])  # (-1, -1) and (-1, 1): 2 apart
     figures = overfit_metrics(surface, Affine([1, 0, 0], [0, 1, 0], [0, 0, 0]), samples=100)
     assert figures["seam_gap_percent"] == pytest.approx(200 / DIAGONAL)
 
@@ -115,7 +115,7 @@ def test_saved_and_loaded_is_the_same(neural, tmp_path):
     again = load_surface(tmp_path)
     uv = torch.rand(10, 2)
     assert torch.equal(neural.map(uv), again.map(uv))
-    for name in ("vertices", "faces", "uv", "twins", "source_vertex", "cut_vertex", "center"):
+    for name in ("vertices", "faces", "uv", "seam_pairs", "source_vertex", "cut_vertex", "center"):
         assert np.array_equal(getattr(neural.surface, name), getattr(again.surface, name))
     assert again.metrics == neural.metrics
     assert again.config == neural.config
@@ -268,12 +268,12 @@ def test_no_crease_shows_where_a_mesh_was_cut():
     surface = Surface.from_arrays(ball.vertices, ball.faces, cache=False)
     exact = surface.vertices / np.linalg.norm(surface.vertices, axis=1)[:, None]
     turned = {}
-    for name, twins in (("cut", None), ("whole", surface.twins)):
-        normal = vertex_normals(surface.vertices, surface.faces, twins)
+    for name, seam_pairs in (("cut", None), ("whole", surface.seam_pairs)):
+        normal = vertex_normals(surface.vertices, surface.faces, seam_pairs)
         turned[name] = np.degrees(np.arccos(np.clip((normal * exact).sum(axis=1), -1, 1)))
         assert np.allclose(np.linalg.norm(normal, axis=1), 1)
     assert turned["whole"].max() < 3 < turned["cut"].max()
-    a, b = vertex_normals(surface.vertices, surface.faces, surface.twins)[surface.twins.T]
+    a, b = vertex_normals(surface.vertices, surface.faces, surface.seam_pairs)[surface.seam_pairs.T]
     assert np.allclose(a, b)
 
 

@@ -163,7 +163,7 @@ def test_seams_are_the_edges_that_were_cut(closed, f):
     assert len(scene_of(f).source.seam) == 0
     # and shading does not show them
     normals = shape.normals(shape.vertices)
-    assert normals[shape.twins[:, 0]] == pytest.approx(normals[shape.twins[:, 1]])
+    assert normals[shape.seam_pairs[:, 0]] == pytest.approx(normals[shape.seam_pairs[:, 1]])
     outward = shape.vertices / np.linalg.norm(shape.vertices, axis=1)[:, None]
     assert (normals * outward).sum(axis=1).min() > 0.99
 

@@ -31,10 +31,10 @@ def height(z):
     return Graph(lambda p: torch.stack([p[0], p[1], z(p[0])]))
 
 
-def sheet(vertices, twins=()) -> Surface:
+def sheet(vertices, seam_pairs=()) -> Surface:
     i = (np.arange(N)[:, None] * (N + 1) + np.arange(N)).ravel()
     halves = [np.stack([i, i + N + 1, i + N + 2], 1), np.stack([i, i + N + 2, i + 1], 1)]
-    pairs = np.array(twins, dtype=np.int64).reshape(-1, 2)
+    pairs = np.array(seam_pairs, dtype=np.int64).reshape(-1, 2)
     return as_it_lies("sheet", vertices, np.concatenate(halves), UV, "square", pairs)
 
 

@@ -63,18 +63,18 @@ def check(surface: Surface) -> None:
     assert radius.max() <= 1 + 1e-12
     area = topology.face_areas(surface.vertices, surface.faces).sum()
     assert area == pytest.approx(np.pi if surface.domain == "disc" else 4)
-    a, b = surface.twins.T
+    a, b = surface.seam_pairs.T
     assert np.array_equal(surface.vertices[a], surface.vertices[b])
-    assert set(surface.twins.ravel()) <= set(loop)
+    assert set(surface.seam_pairs.ravel()) <= set(loop)
     assert surface.quality["flipped_triangles"] == 0
     known = surface.source_vertex >= 0
     assert len(surface.source_vertex) == len(surface.vertices)
     # each seam vertex has a twin; other copies are those of vertices where faces only touched
     _, count = np.unique(surface.source_vertex[known], return_counts=True)
     if any("touch at a point" in line for line in surface.log):
-        assert len(surface.twins) <= (count - 1).sum()
+        assert len(surface.seam_pairs) <= (count - 1).sum()
     else:
-        assert len(surface.twins) == (count - 1).sum()
+        assert len(surface.seam_pairs) == (count - 1).sum()
 
 
 def mean_energy(surface: Surface) -> float:
@@ -339,7 +339,7 @@ def test_prepared_surfaces_are_cached_by_content(tmp_path, monkeypatch):
     assert any("cache" in line for line in again.log)
     assert not any("cache" in line for line in first.log)
     assert np.array_equal(first.uv, again.uv)
-    assert np.array_equal(first.twins, again.twins)
+    assert np.array_equal(first.seam_pairs, again.seam_pairs)
     assert first.quality == again.quality
     assert not any("cache" in line for line in Surface.load("cone", domain="square").log)
     for entry in (tmp_path / "surfaces").iterdir():

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.multiprocessing.spawn import ProcessRaisedException
 
-from nsm.data.parts import Part
+from nsm.data.shard import Shard
 from nsm.errors import NsmError
 from nsm.pipeline.processes import told_by
 
@@ -28,7 +28,7 @@ phis = [
                 overrides=[*short, "data.batch_size=128", f"trainer.devices={n}"])
     for n in (1, 2)
 ]
-words = [*short, "data.batch_size=96", "guarantee.repair=false", "optimizer.lr=0.0005"]
+words = [*short, "data.batch_size=96", "certification.repair=false", "optimizer.lr=0.0005"]
 for n in (1, 2):
     nsm.map_pair(phis[0], phis[1], [(7, 7), (900, 900), (1500, 1500)],
                  folder=folder / f"pair_{n}", progress=False,
@@ -68,10 +68,10 @@ def test_two_processes_give_the_result_of_one(tmp_path):
 
 def test_parts_are_equal_and_apart():
     rows = torch.arange(11)
-    parts = [Part(rank, 3).of_rows(rows) for rank in range(3)]
+    parts = [Shard(rank, 3).of_rows(rows) for rank in range(3)]
     assert [len(part) for part in parts] == [3, 3, 3]
     assert sorted(torch.cat(parts).tolist()) == list(range(9))
-    assert torch.equal(Part().of_rows(rows), rows)
+    assert torch.equal(Shard().of_rows(rows), rows)
 
 
 def test_bad_input_in_a_process_is_told_as_such():

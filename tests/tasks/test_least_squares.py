@@ -12,7 +12,7 @@ from nsm.pipeline import build_overfit
 from nsm.results import pointwise_metrics
 from nsm.surfaces import Surface
 from nsm.surfaces.surface import as_it_lies
-from nsm.tasks.least_squares import _fit_tables, fit_readout
+from nsm.tasks.least_squares import _fit_tables, fit_linear_skip
 
 GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}
 MATRIX = np.array([[1.0, 0.3], [-0.2, 0.8], [0.5, 0.1]])
@@ -34,9 +34,9 @@ def sheet(height) -> Surface:
 )
 def test_a_plane_is_met_exactly(encoding):
     """Affine functions are in the span of every encoding."""
-    network = build_map({"width": 8, "depth": 1, "encoding": encoding, "readout": "fitted"})
+    network = build_map({"width": 8, "depth": 1, "encoding": encoding, "linear_skip": "fitted"})
     flat = sheet(lambda u, v: 0 * u + 2)
-    fit_readout(network, flat)
+    fit_linear_skip(network, flat)
     uv = torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1
     value, jacobian = network.value_and_jacobian(uv)
     expected = uv @ torch.tensor(MATRIX.T, dtype=torch.float32) + torch.tensor([0.0, 0.0, 2.0])
@@ -49,7 +49,7 @@ def test_a_spline_of_the_grid_is_found_again(monkeypatch):
     monkeypatch.setattr("nsm.tasks.least_squares._SMOOTH", 1e-6)  # it is as rough as can be
     torch.manual_seed(0)
     grid, found = SplineGrid(2, [4, 8], 3), SplineGrid(2, [4, 8], 3)
-    readout = torch.nn.Linear(grid.out_dim, 3)
+    linear_skip = torch.nn.Linear(grid.out_dim, 3)
     with torch.no_grad():
         for table in grid.tables:
             table.normal_()
@@ -60,9 +60,9 @@ def test_a_spline_of_the_grid_is_found_again(monkeypatch):
             return stack[:, :, 2:5] + stack[:, :, 5:8]
 
         target = spline(value_and_jacobian_stack(grid, uv)).double()
-        _fit_tables(found, readout, uv, along, target)
-        stack = value_and_jacobian_stack(found, uv) @ readout.weight.t()
-        stack[0] += readout.bias
+        _fit_tables(found, linear_skip, uv, along, target)
+        stack = value_and_jacobian_stack(found, uv) @ linear_skip.weight.t()
+        stack[0] += linear_skip.bias
     torch.testing.assert_close(stack, target.float(), rtol=0, atol=5e-3)
 
 
@@ -71,7 +71,7 @@ def test_a_curved_surface_is_met_before_any_training():
     words = ["domain=square", "encoding.resolutions=[8,32]", "seed=3"]
     fitted, plain = (
         pointwise_metrics(
-            wave, build_overfit(compose_config([*words, f"map.readout={r}"]), wave).map
+            wave, build_overfit(compose_config([*words, f"map.linear_skip={r}"]), wave).map
         )
         for r in ("fitted", "linear")
     )
@@ -89,20 +89,20 @@ def test_the_boundary_is_met_the_better_for_samples_on_it(monkeypatch):
     for every in (33, 10**9):
         monkeypatch.setattr("nsm.tasks.least_squares._BOUNDARY_EVERY", every)
         encoding = {**GRID, "resolutions": [8]}
-        network = build_map({"width": 8, "depth": 1, "encoding": encoding, "readout": "fitted"})
-        fit_readout(network, rough)
+        network = build_map({"width": 8, "depth": 1, "encoding": encoding, "linear_skip": "fitted"})
+        fit_linear_skip(network, rough)
         with torch.no_grad():
             errors.append(float((network(uv) - wanted).square().sum(dim=1).mean().sqrt()))
     assert errors[0] < 0.95 * errors[1]
 
 
 def test_too_few_features_are_told():
-    config = compose_config(["map.readout=fitted", "encoding.features=2", "domain=square"])
+    config = compose_config(["map.linear_skip=fitted", "encoding.features=2", "domain=square"])
     with pytest.raises(NsmError, match="needs 3 features"):
         build_overfit(config, sheet(lambda u, v: 0 * u))
 
 
 def test_maps_of_the_plane_have_nothing_to_fit():
-    with pytest.raises(NsmError, match="map.readout"):
-        compose_config(["task=param", "map.readout=fitted"])
-    compose_config(["task=param", "map.readout=linear"])
+    with pytest.raises(NsmError, match="map.linear_skip"):
+        compose_config(["task=param", "map.linear_skip=fitted"])
+    compose_config(["task=param", "map.linear_skip=linear"])

@@ -18,7 +18,7 @@ from nsm.pipeline.pair_map import build_pair_map
 from nsm.pipeline.param import build_param
 from nsm.results import NeuralSurface
 from nsm.surfaces import Surface
-from nsm.surfaces.together import matched_landmarks
+from nsm.surfaces.joint_preparation import matched_landmarks
 
 SMALL = ["encoding.resolutions=[4,8]", "map.width=8"]
 

@@ -94,7 +94,7 @@ def with_gradients(optimizer, network, steps):
 
 def test_muon_takes_the_matrices_of_hidden_layers_and_adam_the_rest():
     torch.manual_seed(0)
-    shape = {"width": 8, "depth": 2, "readout": "linear", "encoding": {"name": "spline_grid"}}
+    shape = {"width": 8, "depth": 2, "linear_skip": "linear", "encoding": {"name": "spline_grid"}}
     network = build_map(shape)
     settings = {"name": "muon", "lr": 1e-3, "encoding_lr": 1e-2}
     optimizer = build_optimizer(network, settings)

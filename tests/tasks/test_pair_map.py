@@ -7,9 +7,9 @@ import torch
 from nsm.maps import build_analytic
 from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks import CollectionMap, PairMap
-from nsm.tasks import weakest as weakest_module
-from nsm.tasks.start import landmark_rotation, least_distorting_rotation
-from nsm.tasks.weakest import Weakest
+from nsm.tasks import fold_barrier as fold_barrier_module
+from nsm.tasks.fold_barrier import FoldBarrier
+from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
 SETTINGS = {
     "map": {
@@ -280,9 +280,9 @@ def test_a_large_mesh_is_gone_through_in_parts(monkeypatch):
     asked: list[int] = []
     uv, faces = ring_mesh(24)
     mesh = torch.as_tensor(uv, dtype=torch.float32), torch.as_tensor(faces)
-    whole, parts = Weakest(*mesh), Weakest(*mesh)
+    whole, parts = FoldBarrier(*mesh), FoldBarrier(*mesh)
     whole(folding, 0)
-    monkeypatch.setattr(weakest_module, "_LOOK", 600)
+    monkeypatch.setattr(fold_barrier_module, "_LOOK", 600)
     asked.clear()
     for step in range(0, 25 * 6, 25):  # once through all
         parts(folding, step)
@@ -292,7 +292,7 @@ def test_a_large_mesh_is_gone_through_in_parts(monkeypatch):
 
 
 def test_the_weakest_triangles_are_those_that_fold():
-    weakest = Weakest(*MESH)
+    weakest = FoldBarrier(*MESH)
 
     def folding(x):  # the right end is folded back
         return torch.where(x[:, :1] > 0.8, torch.stack([1.6 - x[:, 0], x[:, 1]], dim=1), x)
@@ -308,7 +308,7 @@ def test_folded_triangles_are_unfolded():
     values = torch.tensor([[0.05, 0.0]]).repeat(len(MESH[0]), 1) + MESH[0]
     centre = MESH[0].norm(dim=1) == 0
     moved = torch.where(centre[:, None], values + 0.14, values).requires_grad_()
-    weakest, optimiser = Weakest(*MESH), torch.optim.Adam([moved], lr=0.01)
+    weakest, optimiser = FoldBarrier(*MESH), torch.optim.Adam([moved], lr=0.01)
     start = weakest(lambda x: moved if len(x) == len(moved) else moved[nearest(x)], 0)
     assert start > 0
     for step in range(400):

@@ -50,7 +50,7 @@ class Shape:
         uv: (V, 2) coordinates in its own domain.
         own: (V, 3) or (V, 2), the vertices as they are told: in the units of the mesh file, or the
             new coordinates of a flattening.
-        twins: (T, 2) vertices that were one before the mesh was cut.
+        seam_pairs: (T, 2) vertices that were one before the mesh was cut.
         landmarks: (L,) vertices.
     """
 
@@ -59,14 +59,14 @@ class Shape:
     faces: np.ndarray
     uv: np.ndarray
     own: np.ndarray
-    twins: np.ndarray
+    seam_pairs: np.ndarray
     landmarks: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @cached_property
     def _uncut(self) -> np.ndarray:
         """Of each vertex (V,) the first of those that were one with it."""
         first = np.arange(len(self.vertices))
-        first[self.twins[:, 1]] = self.twins[:, 0]
+        first[self.seam_pairs[:, 1]] = self.seam_pairs[:, 0]
         return first
 
     @cached_property
@@ -80,7 +80,7 @@ class Shape:
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
         """Unit normals (V, 3) where its vertices are at (V, 3); the seam is smooth."""
-        return vertex_normals(vertices, self.faces, self.twins)
+        return vertex_normals(vertices, self.faces, self.seam_pairs)
 
 
 class Scale(NamedTuple):
@@ -256,7 +256,7 @@ def _flat(result: Parameterization, frame: np.ndarray) -> Scene:
     # turned to the viewer, whichever way the surface is looked at
     flat = (uv - middle) @ frame[:2]
     source = _file_shape(s.name, result.phi, s.vertices - _centre(s.vertices, frame), s.vertices)
-    target = Shape(f"{s.name}: flattened", flat, s.faces, s.uv, uv, s.twins)
+    target = Shape(f"{s.name}: flattened", flat, s.faces, s.uv, uv, s.seam_pairs)
     boards = {
         "checkerboard of the plane": 2 * (uv - middle) / np.ptp(uv, axis=0).max(),
         "checkerboard of the domain": s.uv,
@@ -287,7 +287,7 @@ def _file_shape(
     ids = () if landmarks is None else landmarks
     rows = [int(s.cut_vertex[vertex]) for vertex in ids]
     own = neural.in_original_units(vertices)
-    return Shape(name, shown, s.faces, s.uv, own, s.twins, np.array(rows, dtype=np.int64))
+    return Shape(name, shown, s.faces, s.uv, own, s.seam_pairs, np.array(rows, dtype=np.int64))
 
 
 def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from matplotlib.colors import hsv_to_rgb
 from trimesh.creation import icosphere
 
 from nsm.errors import NsmError
-from nsm.extras import needed
+from nsm.optional_dependencies import needed
 from nsm.results.artifact import NeuralSurface
 from nsm.results.collection import SurfaceCollection
 from nsm.results.parameterization import Parameterization

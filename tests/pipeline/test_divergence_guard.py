@@ -20,11 +20,11 @@ import nsm
 from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
-from nsm.pipeline.alone import alone
+from nsm.pipeline.folder_lock import folder_lock
 from nsm.results import analytic
 from nsm.results.analytic import analytic_surface
 from nsm.results.files import read_pair, write_pair
-from nsm.tasks import Overfit, splitting
+from nsm.tasks import Overfit, microbatching
 
 WORDS = ["experiment=quick", "data.steps_per_epoch=10", "data.held_out=64", "data.batch_size=64"]
 WORDS += ["encoding.resolutions=[8]", "trainer.threads=1", "logger=none", "artefacts=false"]
@@ -428,7 +428,7 @@ def test_a_second_run_in_a_folder_is_refused_in_one_line(here, tmp_path):
     finally:
         holder.kill()
         holder.wait()
-    with alone(tmp_path / "run"):  # the lock died with its process
+    with folder_lock(tmp_path / "run"):  # the lock died with its process
         pass
 
 
@@ -478,8 +478,8 @@ def test_gradients_of_parts_add_up_to_those_of_the_whole():
     x = torch.rand(37, 2, dtype=torch.float64)
     gradients = []
     for parts in (1, 2, 8, 256):
-        task = splitting.Splitting()
-        task.parts = parts
+        task = microbatching.Microbatching()
+        task.microbatches = parts
         network.zero_grad()
         (y,) = task.pointwise(lambda part: (network(part),), x)
         ((y**2).sum() / y.abs().sum()).backward()  # no sum over points

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nsm
-from nsm.pipeline import guarantee
+from nsm.pipeline import certification
 from nsm.results import analytic
 from nsm.results.analytic import analytic_surface
 
@@ -40,22 +40,22 @@ def forced(ends, folder, *words):
 
 
 def test_a_map_that_flips_is_repaired_and_says_so(ends, tmp_path, capsys):
-    _, told = forced(ends, tmp_path / "plain", "guarantee.repair=false")
+    _, told = forced(ends, tmp_path / "plain", "certification.repair=false")
     assert told["certified"] is False and told["flipped_triangles"] > 0
     assert told["flipped_triangles"] == told["before_repair"]["flipped_triangles"]
     assert "NOT certified" in capsys.readouterr().out
-    f, mended = forced(ends, tmp_path / "mended")
-    assert mended["certified"] is True and mended["flipped_triangles"] == 0
-    assert mended["before_repair"] == told["before_repair"]
+    f, repaired = forced(ends, tmp_path / "repaired")
+    assert repaired["certified"] is True and repaired["flipped_triangles"] == 0
+    assert repaired["before_repair"] == told["before_repair"]
     assert f.metrics["flipped_percent"] == 0 and f.metrics["certified"] is True
-    assert nsm.load(tmp_path / "mended").certificate["certified"]
+    assert nsm.load(tmp_path / "repaired").certificate["certified"]
 
 
 def test_where_moving_vertices_is_not_enough_training_goes_on(ends, tmp_path, monkeypatch):
-    monkeypatch.setattr(nsm.SurfaceMap, "mended", lambda self: self)
-    monkeypatch.setattr(guarantee, "_SHARE", 1)  # as many steps again
-    _, short = forced(ends, tmp_path / "short", "guarantee.rounds=0")
-    _, long = forced(ends, tmp_path / "long", "guarantee.rounds=2")
+    monkeypatch.setattr(nsm.SurfaceMap, "repaired", lambda self: self)
+    monkeypatch.setattr(certification, "_SHARE", 1)  # as many steps again
+    _, short = forced(ends, tmp_path / "short", "certification.rounds=0")
+    _, long = forced(ends, tmp_path / "long", "certification.rounds=2")
     assert short["rounds"] == 0 and not short["certified"]
     assert 1 <= long["rounds"] <= 2
     assert long["flipped_triangles"] < long["before_repair"]["flipped_triangles"]

@@ -26,7 +26,7 @@ def out_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and any(sign in told for sign in _SIGNS)
 
 
-class Splitting(pl.LightningModule):
+class Microbatching(pl.LightningModule):
     """Base of the tasks: a step that runs out of memory is tried again with its batch in halves.
 
     Networks are evaluated part by part, and once more for each part's gradient, so that only one
@@ -34,26 +34,26 @@ class Splitting(pl.LightningModule):
     that of the whole batch, also where it is no sum over points.
 
     Attributes:
-        parts: how many parts a batch is evaluated in; in the checkpoint, so that a resumed training
+        microbatches: how many parts a batch is evaluated in; in the checkpoint, so that a resumed training
             goes on the same way.
     """
 
-    parts: int = 1
+    microbatches: int = 1
 
     def pointwise(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
     ) -> tuple[Tensor, ...]:
-        """``function(x)``, evaluated on ``parts`` parts of x (N, ...).
+        """``function(x)``, evaluated on ``microbatches`` parts of x (N, ...).
 
         Args:
             function: from x to tensors (N, ...), each row of which depends on that row of x alone.
             x: (N, ...).
         """
-        if self.parts == 1:
+        if self.microbatches == 1:
             return function(x)
         results = [
             checkpoint(function, part, use_reentrant=False)
-            for part in x.tensor_split(min(self.parts, len(x)))
+            for part in x.tensor_split(min(self.microbatches, len(x)))
         ]
         return tuple(torch.cat(same) for same in zip(*results, strict=True))
 
@@ -71,12 +71,12 @@ class Splitting(pl.LightningModule):
         """
         assert optimizer_closure is not None
         while not self._stepped(epoch, batch_idx, optimizer, optimizer_closure):
-            if self.parts >= _MOST:
+            if self.microbatches >= _MOST:
                 raise NsmError(
-                    f"out of memory, even with a batch in {self.parts} parts; lower "
+                    f"out of memory, even with a batch in {self.microbatches} parts; lower "
                     "data.batch_size or map.width"
                 )
-            self.parts *= 2
+            self.microbatches *= 2
             gc.collect()
             if torch.cuda.is_available():
                 torch.cuda.empty_cache()
@@ -111,7 +111,7 @@ class Splitting(pl.LightningModule):
         return True
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["nsm_parts"] = self.parts
+        checkpoint["nsm_parts"] = self.microbatches
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.parts = int(checkpoint.get("nsm_parts", 1))
+        self.microbatches = int(checkpoint.get("nsm_parts", 1))

@@ -16,7 +16,7 @@ _EVERY = 25  # steps between two looks at the triangles
 _LOOK = 16_384
 
 
-class Weakest(nn.Module):
+class FoldBarrier(nn.Module):
     """Finds the triangles whose images have the least signed area relative to their own.
 
     Samples of Ω hardly ever meet the few triangles that fold; flips are counted on the mesh, so
@@ -94,7 +94,7 @@ def stronger(weight: float) -> float:
 def carefully(module: pl.LightningModule, steps: int) -> None:
     """Watch four times as many triangles, and train at a tenth of the rates for so many steps."""
     for part in module.modules():
-        if isinstance(part, Weakest):
+        if isinstance(part, FoldBarrier):
             part.watch(4 * part.chosen.shape[-1])
     optimizer = module.hparams["optimizer"]
     for rate in ("lr", "encoding_lr"):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd.graph import saved_tensors_hooks
 
-from nsm.maps import ACTIVATIONS, BLOCKS, SplineGrid, build_map, trunk
+from nsm.maps import ACTIVATIONS, BLOCKS, SplineGrid, build_map, mlp_with_tangents
 
 
 def made(activation: str, block: str, depth: int = 2, width: int = 5) -> torch.nn.Module:
@@ -56,7 +56,7 @@ def test_finite_differences(activation, block):
 @pytest.mark.parametrize("block", BLOCKS)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_plain_autograd(activation, block, at_once, frozen, monkeypatch):
-    monkeypatch.setattr(trunk, "_AT_ONCE", at_once)
+    monkeypatch.setattr(mlp_with_tangents, "_AT_ONCE", at_once)
     net, x = made(activation, block).requires_grad_(not frozen), points().requires_grad_()
     loss_of(*net.value_and_jacobian(x)).backward()
     by_parameter, by_point = plain_gradients(net, x.detach())

@@ -1,4 +1,4 @@
-"""The guarantee of maps: verified on the whole mesh, repaired, or told plainly that it is not."""
+"""Certify maps: check the whole mesh, repair flips, and say plainly where that failed."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Certified(Protocol):
     @property
     def certificate(self) -> dict[str, Any]: ...
 
-    def mended(self) -> Any: ...
+    def repaired(self) -> Any: ...
 
 
 Result = TypeVar("Result", bound=Certified)
 
 
-def guaranteed(
+def certified(
     config: DictConfig,
     trainer: pl.Trainer,
     module: Any,
@@ -39,7 +39,7 @@ def guaranteed(
     on with stronger terms for a bounded number of rounds, and the mesh is mended again.
 
     Args:
-        config: with ``guarantee.repair`` and ``guarantee.rounds``.
+        config: with ``certification.repair`` and ``certification.rounds``.
         trainer: that of the training, with its data.
         module: the task's module, which answers ``strengthen(steps)``.
         make: the result from the module as it stands.
@@ -49,12 +49,12 @@ def guaranteed(
         The result; and what metrics.json says of it: its certificate, with the counts that the
         network alone had (``before_repair``) and the rounds that it took.
     """
-    settings = config.guarantee
+    settings = config.certification
     result = make()
     before = result.certificate
     rounds = 0
     while settings.repair and not result.certificate["certified"]:
-        result = result.mended()
+        result = result.repaired()
         if result.certificate["certified"] or rounds >= settings.rounds:
             break
         rounds += 1

@@ -12,7 +12,7 @@ from rich.console import Console
 
 import nsm
 from nsm.config import compose_config
-from nsm.pipeline.neural import made_once, made_together
+from nsm.pipeline.surface_cache import made_batched, made_once
 
 SMALL = [
     "experiment=quick",
@@ -36,7 +36,7 @@ def made(surfaces, words: list[str], *, together: bool) -> tuple[list[nsm.Neural
     told = io.StringIO()
     console = Console(file=told)
     if together:
-        return made_together(surfaces, config, console, in_one_batch=True), told.getvalue()
+        return made_batched(surfaces, config, console, in_one_batch=True), told.getvalue()
     return [made_once(surface, config, console) for surface in surfaces], told.getvalue()
 
 

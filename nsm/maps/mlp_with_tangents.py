@@ -24,7 +24,7 @@ from nsm.maps.activations import Activation
 _AT_ONCE = 192 * 1024
 
 
-class Trunk(torch.autograd.Function):
+class MLPWithTangents(torch.autograd.Function):
     """Hidden layers a_k = act(z_k), z_k = W_k a_{k−1} + b_k + r_k, and an output layer without act.
 
     r_k is zero but in every second hidden layer (k = 2, 4, ...), where it is a_{k−2} for
@@ -63,7 +63,7 @@ class Trunk(torch.autograd.Function):
                 a = _linear(a, weight, bias, residual if joins else None)
                 if joins and skip == "pre":
                     residual = a.clone()
-                kept = activation.push_(_planes(a), record)
+                kept = activation.jvp_(_planes(a), record)
                 if joins and skip == "post":
                     residual = a
                 if record:
@@ -93,7 +93,7 @@ class Trunk(torch.autograd.Function):
                 joins = ctx.skip is not None and k % 2 == 0
                 if k < layers - 1:
                     result, kept = tape[at], tape[at + 1 : at + stride]
-                    ctx.activation.pull_(
+                    ctx.activation.vjp_(
                         _planes(g), None if result is None else _planes(result), kept
                     )
                     if joins and ctx.skip == "pre" and carried is not None:

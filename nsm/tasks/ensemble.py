@@ -12,7 +12,7 @@ from nsm.tasks.optimizers import Shares, in_one, scheduled
 from nsm.tasks.training import Training
 
 
-class Parted(Exception):
+class EnsembleSplit(Exception):
     """Trainings in one batch cannot go on together.
 
     Args:
@@ -25,7 +25,7 @@ class Parted(Exception):
         self.which = list(which)
 
 
-class Several(Training):
+class Ensemble(Training):
     """Base of k trainings in one batch.
 
     The loss is the sum of theirs, no network sees another's share of it, and the optimiser's step
@@ -110,8 +110,8 @@ class Several(Training):
         self.stored = []  # all is taken up
 
 
-def apart(module: pl.LightningModule) -> dict[str, nn.Module]:
+def members(module: pl.LightningModule) -> dict[str, nn.Module]:
     """The trainings of a module, by what ends the names of their figures in a log."""
-    if isinstance(module, Several):
+    if isinstance(module, Ensemble):
         return {f"@{i}": one for i, one in enumerate(module.each)}
     return {"": module}

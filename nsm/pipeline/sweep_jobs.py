@@ -14,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from nsm.config import checked, register_resolvers
 from nsm.errors import NsmError
 from nsm.pipeline import run_held
-from nsm.pipeline.alone import alone
 from nsm.pipeline.common import CONFIG_FILE
+from nsm.pipeline.folder_lock import folder_lock
 from nsm.sweeps import is_complete
 
 Result = TypeVar("Result")
@@ -46,7 +46,7 @@ def run_job(settings: dict[str, Any], folder: str, cwd: str, *, log: bool) -> st
             run_held(job_config(settings, place), place)
 
     try:
-        with alone(place), _output(place / LOG_FILE if log else None):
+        with folder_lock(place), _output(place / LOG_FILE if log else None):
             (place / ERROR_FILE).unlink(missing_ok=True)
             return attempted(place, run)[1]
     except NsmError as error:  # another process is at work on it

@@ -9,13 +9,13 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from nsm.errors import NsmError
-from nsm.folders import remove_empty
+from nsm.run_directories import remove_empty
 
 LOCK_FILE = ".lock"
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def folder_lock(folder: Path) -> Iterator[None]:
     """Hold a run folder, which is made if need be, and taken away if nothing came of it; the
     operating system lets go of it when the process ends, however that happens.
 

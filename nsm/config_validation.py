@@ -25,7 +25,7 @@ from nsm.errors import NsmError
 from nsm.maps import build_map
 from nsm.maps.activations import ACTIVATIONS
 from nsm.maps.encodings import ENCODINGS
-from nsm.maps.networks import BLOCKS, INITIALISATIONS, READOUTS
+from nsm.maps.networks import BLOCKS, INITIALIZATIONS, LINEAR_SKIPS
 from nsm.results.loggers import LOGGERS, require
 from nsm.surfaces.correspondence import SEAMS
 from nsm.surfaces.parameterization import METHODS
@@ -70,8 +70,11 @@ def check_choices(config: DictConfig) -> None:
         require(kind)
     for group, known in named().items():
         _check_named(group, settings[group], known)
-    if settings["map"]["readout"] == "fitted" and task != "overfit":
-        raise NsmError(f"setting map.readout: task={task} has no surface to fit; take start=random")
+    if settings["map"]["linear_skip"] == "fitted" and task != "overfit":
+        raise NsmError(
+            f"setting map.linear_skip: task={task} has no surface to fit; "
+            "take initialization=random"
+        )
     choice = TASK_CHOICES[task]
     if choice.constraints:
         held = settings["constraints"] or {}
@@ -151,8 +154,8 @@ def named() -> dict[str, dict[str, Parameters]]:
 _WORDS: dict[str, Iterable[str]] = {
     "domain": DOMAINS,
     "map.block": BLOCKS,
-    "map.initialisation": INITIALISATIONS,
-    "map.readout": READOUTS,
+    "map.initialization": INITIALIZATIONS,
+    "map.linear_skip": LINEAR_SKIPS,
     "surface.parameterization": METHODS,
     "seam.path": ("auto", *SEAMS),
     "trainer.accelerator": ACCELERATORS,

@@ -17,12 +17,12 @@ from rich.console import Console
 from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline.common import CHECKPOINT_FILE, Run, configured_surface, plain, report_surface
-from nsm.pipeline.overfit import common_settings, leave_results, overfit_together, overfitted
+from nsm.pipeline.overfit import common_settings, leave_results, overfit_ensemble, overfitted
 from nsm.results import NeuralSurface, load_surface
 from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
-from nsm.tasks.several import Parted
+from nsm.tasks.ensemble import EnsembleSplit
 
 # of how neural surfaces are made: to be raised when the same settings come to make others
 _VERSION = 2
@@ -41,7 +41,7 @@ _INCIDENTAL = (
     "artefacts",
     "seam",
     "constraints",
-    "guarantee",
+    "certification",
 )
 
 
@@ -84,7 +84,7 @@ def _made(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurf
         return overfitted(overfit, folder, surface, console, started, resuming=resuming)
 
 
-def made_together(
+def made_batched(
     surfaces: Sequence[Surface], config: DictConfig, console: Console, *, in_one_batch: bool
 ) -> list[NeuralSurface]:
     """As :func:`made_once` of each, but nothing is reported of the prepared ones.
@@ -118,8 +118,8 @@ def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Cons
         if len(runs) < 2 or len({run.stage for run in runs}) > 1 or runs[0].stage is None:
             return  # what was begun alone goes on alone
         try:
-            modules, trainer = overfit_together(runs, list(left.values()), console)
-        except Parted as fault:
+            modules, trainer = overfit_ensemble(runs, list(left.values()), console)
+        except EnsembleSplit as fault:
             console.print(f"{fault}; each goes on alone")
             return
         for i, (run, surface, module) in enumerate(zip(runs, left.values(), modules, strict=True)):

@@ -14,10 +14,11 @@ from rich.console import Console
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
 from nsm.pipeline.common import accelerator_of, report_surface
-from nsm.pipeline.neural import made_together
+from nsm.pipeline.surface_cache import made_batched
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.surfaces import Surface
 from nsm.surfaces.catalogue import catalogue_mesh
+from nsm.surfaces.joint_preparation import Mesh, prepare_jointly
 from nsm.surfaces.landmarks import (
     Landmarks,
     as_lists,
@@ -29,7 +30,6 @@ from nsm.surfaces.landmarks import (
     read_pairs,
 )
 from nsm.surfaces.loading import load_mesh
-from nsm.surfaces.together import Mesh, prepare_together
 
 Shape = NeuralSurface | Mesh
 
@@ -168,9 +168,7 @@ def neural_surfaces(
         prepared = _prepare(config, meshes, landmarks)
         for surface in prepared:
             report_surface(console, surface)
-        made = made_together(
-            prepared, config, console, in_one_batch=accelerator_of(config) == "gpu"
-        )
+        made = made_batched(prepared, config, console, in_one_batch=accelerator_of(config) == "gpu")
         for (k, _), phi in zip(meshes, made, strict=True):
             result[k] = phi
     return [r for r in result if r is not None]
@@ -180,7 +178,7 @@ def _prepare(
     config: DictConfig, meshes: Sequence[tuple[int, Mesh]], landmarks: Sequence[np.ndarray]
 ) -> list[Surface]:
     settings = config.surface
-    return prepare_together(
+    return prepare_jointly(
         [mesh for _, mesh in meshes],
         [landmarks[k] if len(meshes) > 1 else np.zeros(0, np.int64) for k, _ in meshes],
         domain=config.domain,

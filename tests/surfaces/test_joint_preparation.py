@@ -16,7 +16,7 @@ from nsm.surfaces.correspondence import (
 )
 from nsm.surfaces.cutting import cut_along_paths
 from nsm.surfaces.domain import at_fractions
-from nsm.surfaces.together import Mesh, matched_landmarks, prepare_together
+from nsm.surfaces.joint_preparation import Mesh, matched_landmarks, prepare_jointly
 
 
 def ball(subdivisions=3):
@@ -90,7 +90,7 @@ def test_walks_in_other_orders_are_not_alike():
 @pytest.mark.parametrize("domain", ["disc", "square"])
 def test_landmarks_on_the_seam_have_the_same_place_in_all_domains(pair, domain):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, domain=domain, seam="shortest", cache=False)
+    surfaces = prepare_jointly(meshes, ids, domain=domain, seam="shortest", cache=False)
     p, q = matched_landmarks(surfaces, ids).points
     assert len(p) == 2 * (len(POINTS) - 1)
     assert np.abs(p - q).max() < 1e-12
@@ -104,7 +104,7 @@ def test_landmarks_on_the_seam_have_the_same_place_in_all_domains(pair, domain):
 
 def test_the_seam_keeps_off_landmarks_that_it_does_not_pass_through(pair):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, seam="hidden", seam_landmarks=3, cache=False)
+    surfaces = prepare_jointly(meshes, ids, seam="hidden", seam_landmarks=3, cache=False)
     p, _ = matched_landmarks(surfaces, ids).points
     inner = np.linalg.norm(p, axis=1) < 1 - 1e-9
     assert inner.sum() == len(POINTS) - 3
@@ -112,7 +112,7 @@ def test_the_seam_keeps_off_landmarks_that_it_does_not_pass_through(pair):
 
 def test_the_best_of_several_seams_is_taken(pair):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, cache=False)
+    surfaces = prepare_jointly(meshes, ids, cache=False)
     told = next(line for line in surfaces[0].log if line.startswith("seam led along"))
     assert "of 6 landmarks, alike on all meshes" in told
     matched_landmarks(surfaces, ids)
@@ -120,25 +120,25 @@ def test_the_best_of_several_seams_is_taken(pair):
 
 def test_prepared_surfaces_are_taken_from_the_cache(pair):
     meshes, ids = pair
-    first = prepare_together(meshes, ids, seam="shortest")
-    second = prepare_together(meshes, ids, seam="shortest")
+    first = prepare_jointly(meshes, ids, seam="shortest")
+    second = prepare_jointly(meshes, ids, seam="shortest")
     assert "prepared surface taken from the cache" in second[1].log
     assert (first[1].uv == second[1].uv).all()
-    other = prepare_together(meshes, [i[::-1] for i in ids], seam="shortest")
+    other = prepare_jointly(meshes, [i[::-1] for i in ids], seam="shortest")
     assert "prepared surface taken from the cache" not in other[1].log
     # cleaned, this mesh is the same, but its vertices have other numbers
     first, second = meshes
     shifted = Mesh("egg", np.concatenate([[[9, 9, 9]], second.vertices]), second.faces + 1)
-    more = prepare_together([first, shifted], [ids[0], ids[1] + 1], seam="shortest")
+    more = prepare_jointly([first, shifted], [ids[0], ids[1] + 1], seam="shortest")
     assert more[1].source_vertex.max() == len(second.vertices)
 
 
 def test_open_meshes_are_left_whole():
     surfaces = [Surface.load(name, cache=False) for name in ("hemisphere", "saddle")]
     meshes = [Mesh(s.name, s.vertices, s.faces) for s in surfaces]
-    together = prepare_together(meshes, [np.array([500, 600])] * 2, cache=False)
+    together = prepare_jointly(meshes, [np.array([500, 600])] * 2, cache=False)
     for surface in together:
-        assert len(surface.twins) == 0
+        assert len(surface.seam_pairs) == 0
     p, q = matched_landmarks(together, [np.array([500, 600])] * 2).points
     assert p.shape == q.shape == (2, 2)
 
@@ -194,7 +194,7 @@ def test_the_animals_are_cut_alike(shared_meshes):
 
 def test_the_common_seam_glues_each_branch_to_its_way_back(pair):
     meshes, ids = pair
-    surfaces = prepare_together(meshes, ids, seam="shortest", cache=False)
+    surfaces = prepare_jointly(meshes, ids, seam="shortest", cache=False)
     matched = matched_landmarks(surfaces, ids)
     seam = matched.seam("disc", 4)
     assert seam.shape == (4 * (len(POINTS) - 1), 2, 2)

@@ -9,14 +9,14 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Part:
+class Shard:
     """Process ``rank`` of ``count``."""
 
     rank: int = 0
     count: int = 1
 
     @classmethod
-    def of(cls, trainer: Any) -> Part:
+    def of(cls, trainer: Any) -> Shard:
         """That of a Lightning trainer, or of none."""
         return cls(trainer.global_rank, trainer.world_size) if trainer else cls()
 

@@ -43,7 +43,7 @@ class Mesh:
     log: tuple[str, ...] = ()
 
 
-def prepare_together(
+def prepare_jointly(
     meshes: Sequence[Mesh],
     landmarks: Sequence[np.ndarray],
     *,

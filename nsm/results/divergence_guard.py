@@ -14,14 +14,14 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
-from nsm.tasks.several import Parted, Several
+from nsm.tasks.ensemble import Ensemble, EnsembleSplit
 
 _EVERY = 50  # steps between two states that are kept
 _TRIES = 5
 _SMALLER = 0.5
 
 
-class Faults(Callback):
+class DivergenceGuard(Callback):
     """Roll back a step whose loss or gradient is not finite, and go on with smaller steps.
 
     A state is kept in memory, and in the checkpoint, every few steps, once the loss and gradient
@@ -43,7 +43,7 @@ class Faults(Callback):
         self.good: dict[str, Any] | None = None
         self.rollbacks: list[dict[str, int]] = []
         self.loss: Tensor | None = None
-        self.parts = 1
+        self.microbatches = 1
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.begun = True
@@ -117,8 +117,8 @@ class Faults(Callback):
         batch_idx: int,
     ) -> None:
         parts = getattr(pl_module, "parts", 1)
-        if parts != self.parts:
-            self.parts = parts
+        if parts != self.microbatches:
+            self.microbatches = parts
             self.console.print(
                 f"step {trainer.global_step}: out of memory; batches are evaluated in {parts} parts"
             )
@@ -137,12 +137,12 @@ class Faults(Callback):
         self.console.print(f"the last step was not finite; back to step {self.good['step']}")
 
     def state_dict(self) -> dict[str, Any]:
-        return {"good": self.good, "rollbacks": self.rollbacks, "parts": self.parts}
+        return {"good": self.good, "rollbacks": self.rollbacks, "parts": self.microbatches}
 
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        if self.good is not None and isinstance(pl_module, Several):
+        if self.good is not None and isinstance(pl_module, Ensemble):
             shown = pl_module.shown
             checkpoint["callbacks"][self.state_key]["good"] = {
                 **self.good,
@@ -153,7 +153,7 @@ class Faults(Callback):
     def on_load_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        if not isinstance(pl_module, Several):
+        if not isinstance(pl_module, Ensemble):
             return
         each = [state["callbacks"][self.state_key]["good"] for state in pl_module.stored]
         joint = None
@@ -167,7 +167,7 @@ class Faults(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.good, self.rollbacks = state_dict["good"], list(state_dict["rollbacks"])
-        self.parts = state_dict["parts"]
+        self.microbatches = state_dict["parts"]
 
 
 def _part(
@@ -175,19 +175,19 @@ def _part(
 ) -> None:
     """Of several trainings, leave those alone that have something that is not finite; all, where it
     is not seen which."""
-    if not isinstance(module, Several):
+    if not isinstance(module, Ensemble):
         return
     bad = []
     for i, one in enumerate(module.each):
         seen = [t for p in one.parameters() if (t := looked_at(p)) is not None]
         if not all(bool(torch.isfinite(t).all()) for t in seen):
             bad.append(i)
-    raise Parted(reason, bad or range(len(module.each)))
+    raise EnsembleSplit(reason, bad or range(len(module.each)))
 
 
-def faults_of(trainer: pl.Trainer) -> dict[str, Any]:
+def guard_of(trainer: pl.Trainer) -> dict[str, Any]:
     """What metrics.json says of a training's faults: rollbacks, and parts of a batch."""
-    watch = next((c for c in trainer.callbacks if isinstance(c, Faults)), None)  # type: ignore[attr-defined]
+    watch = next((c for c in trainer.callbacks if isinstance(c, DivergenceGuard)), None)  # type: ignore[attr-defined]
     return {
         "rollbacks": [] if watch is None else watch.rollbacks,
         "batch_parts": getattr(trainer.lightning_module, "parts", 1),

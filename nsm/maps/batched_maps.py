@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from nsm.maps.composition import PointMap, Rotated
 from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
-from nsm.maps.networks import SKIPS, NeuralMap, read_out
-from nsm.maps.planar import FromIdentity
-from nsm.maps.trunk import Trunk
+from nsm.maps.mlp_with_tangents import MLPWithTangents
+from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
+from nsm.maps.planar import IdentityInitializedMap
 
 
 class Alike(nn.Module):
@@ -40,25 +40,25 @@ class Alike(nn.Module):
             *([p for m in n.layers for p in (m.weight, m.bias)] for n in networks), strict=True
         )
         features = self._encoded(x)
-        stack = Trunk.apply(
+        stack = MLPWithTangents.apply(
             features,
             networks[0].activation,
             SKIPS[networks[0].config["block"]],
             torch.is_grad_enabled(),
             *(torch.stack(same) for same in parameters),
         )
-        linear = [n.readout for n in networks if n.readout is not None]
+        linear = [n.linear_skip for n in networks if n.linear_skip is not None]
         if linear:
             weight, bias = (
                 torch.stack(w) for w in zip(*((m.weight, m.bias) for m in linear), strict=True)
             )
-            stack = read_out(stack, features, weight, bias)
+            stack = add_linear_skip(stack, features, weight, bias)
         return stack[:, 0], stack[:, 1:].permute(0, 2, 3, 1)
 
     def _encoded(self, x: Tensor) -> Tensor:
         encodings = [cast(NeuralMap, network).encoding for network in self.networks]
         if isinstance(encodings[0], SplineGrid):
-            return SplineGrid.stacks_together(cast(Sequence[SplineGrid], encodings), x)
+            return SplineGrid.batched_stacks(cast(Sequence[SplineGrid], encodings), x)
         each = zip(encodings, x, strict=True)
         return torch.stack([value_and_jacobian_stack(e, points) for e, points in each])
 
@@ -88,7 +88,7 @@ class OneByOne(nn.Module):
         return torch.stack(values), torch.stack(jacobians)
 
 
-def together(maps: Sequence[nn.Module]) -> Any:
+def batched(maps: Sequence[nn.Module]) -> Any:
     """One map of points (k, N, 2), N for each of k maps, that does what they do.
 
     Networks, planar maps and rotated ones that are alike but for their weights are evaluated in
@@ -104,11 +104,11 @@ def together(maps: Sequence[nn.Module]) -> Any:
     first = maps[0]
     if all(isinstance(m, Rotated) for m in maps):
         turned = cast(Sequence[Rotated], maps)
-        return Rotated.all_of(turned, together([m.inner for m in turned]))
+        return Rotated.all_of(turned, batched([m.inner for m in turned]))
     if all(type(m) is type(first) for m in maps):
-        if isinstance(first, FromIdentity):
-            networks = [cast(FromIdentity, m).network for m in maps]
-            return type(first).around(together(networks))
+        if isinstance(first, IdentityInitializedMap):
+            networks = [cast(IdentityInitializedMap, m).network for m in maps]
+            return type(first).around(batched(networks))
         if isinstance(first, NeuralMap) and first.config["block"] in SKIPS:
             alike = cast(Sequence[NeuralMap], maps)
             if all(m.config == first.config for m in alike):

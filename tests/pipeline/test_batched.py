@@ -20,8 +20,8 @@ from tiny import TRAINING
 
 from nsm.config import compose_config
 from nsm.pipeline import overfit
-from nsm.pipeline.jobs import run_job
-from nsm.pipeline.together import Call, batches, run_together
+from nsm.pipeline.batched import Call, batches, run_batched
+from nsm.pipeline.sweep_jobs import run_job
 from nsm.results.callbacks import AtomicCheckpoint
 
 TINY = [
@@ -72,7 +72,7 @@ def one_by_one(jobs: list[Call]) -> list[str | None]:
 
 
 def in_one_batch(jobs: list[Call]) -> list[str | None]:
-    ended = dict(run_together(jobs))
+    ended = dict(run_batched(jobs))
     return [ended[number] for number in range(len(jobs))]
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 _COUNT = 512
 
 
-def rim(domain: str) -> Tensor:
+def boundary_samples(domain: str) -> Tensor:
     """Points (N, 2) of ∂Ω, evenly spaced."""
     t = torch.arange(_COUNT) / _COUNT
     if domain == "disc":

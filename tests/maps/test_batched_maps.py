@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nsm.maps import Composition, NeuralMap, Rotated, build_analytic, build_planar, together
-from nsm.maps.together import Alike, OneByOne
+from nsm.maps import Composition, NeuralMap, Rotated, batched, build_analytic, build_planar
+from nsm.maps.batched_maps import Alike, OneByOne
 
 GRID = {"name": "spline_grid", "resolutions": [4, 16], "features": 3}
 NETWORKS: list[dict[str, Any]] = [
@@ -17,7 +17,7 @@ NETWORKS: list[dict[str, Any]] = [
     {"depth": 2, "block": "post", "encoding": {**GRID, "degree": 3}},
     {"depth": 3, "block": "pre", "encoding": {"name": "fourier", "features": 8}},
     {"depth": 2, "block": "post", "activation": {"name": "silu"}},
-    {"depth": 1, "block": "plain", "encoding": GRID, "readout": "linear"},
+    {"depth": 1, "block": "plain", "encoding": GRID, "linear_skip": "linear"},
 ]
 
 
@@ -49,7 +49,7 @@ def gradients(results: tuple[Tensor, ...], by: list[Tensor]) -> tuple[Tensor, ..
 def check(maps: list[Any], count: int = 37) -> None:
     x = (torch.rand(len(maps), count, 2, dtype=torch.float64) - 0.5).requires_grad_()
     parameters = [p for m in maps for p in m.parameters()]
-    batch, alone = answers(together(maps), x), each_alone(maps, x)
+    batch, alone = answers(batched(maps), x), each_alone(maps, x)
     for a, b in zip(batch, alone, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
     got, wanted = (gradients(r, [x, *parameters]) for r in (batch, alone))
@@ -60,7 +60,7 @@ def check(maps: list[Any], count: int = 37) -> None:
 @pytest.mark.parametrize("network", NETWORKS)
 def test_networks(network):
     maps = several(network)
-    assert isinstance(together(maps), Alike)
+    assert isinstance(batched(maps), Alike)
     check(maps)
 
 
@@ -77,7 +77,7 @@ def test_planar_maps_rotated_each_its_own_way(onto):
         torch.nn.init.normal_(h.network.output.weight, std=0.1)
         c, s = angle.cos(), angle.sin()
         maps.append(Rotated(h, torch.stack([torch.stack([c, -s]), torch.stack([s, c])])))
-    assert not isinstance(together(maps).inner, OneByOne)
+    assert not isinstance(batched(maps).inner, OneByOne)
     check(maps)
 
 
@@ -86,7 +86,7 @@ def test_frozen_networks_pass_gradients_on_and_take_none():
     for one in maps:
         one.requires_grad_(False)
     x = torch.rand(3, 9, 2, dtype=torch.float64, requires_grad=True)
-    results = together(maps).value_and_jacobian(x)
+    results = batched(maps).value_and_jacobian(x)
     (gradient,) = gradients(results, [x])
     (wanted,) = gradients(each_alone(maps, x)[:2], [x])
     torch.testing.assert_close(gradient, wanted)
@@ -97,9 +97,9 @@ def test_maps_that_are_not_alike_are_evaluated_all_the_same():
     networks = several(NETWORKS[0], 1) + several(NETWORKS[1], 1)
     cone = build_analytic({"name": "cone"}).double()
     for maps in (networks, [networks[0], cone], [Composition(cone, m) for m in [planar()] * 2]):
-        assert isinstance(together(maps), OneByOne)
+        assert isinstance(batched(maps), OneByOne)
         x = torch.rand(2, 9, 2, dtype=torch.float64) * 0.5
-        for a, b in zip(answers(together(maps), x), each_alone(maps, x), strict=True):
+        for a, b in zip(answers(batched(maps), x), each_alone(maps, x), strict=True):
             torch.testing.assert_close(a, b)
 
 

@@ -16,7 +16,6 @@ from rich.console import Console
 
 from nsm.config import register_resolvers
 from nsm.errors import NsmError
-from nsm.pipeline.alone import alone
 from nsm.pipeline.common import (
     Run,
     configured_surface,
@@ -24,11 +23,12 @@ from nsm.pipeline.common import (
     settle_path,
     stored_config,
 )
-from nsm.pipeline.jobs import ERROR_FILE, attempted, job_config, run_job
-from nsm.pipeline.overfit import common_settings, leave_results, overfit_together
+from nsm.pipeline.folder_lock import folder_lock
+from nsm.pipeline.overfit import common_settings, leave_results, overfit_ensemble
+from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_config, run_job
 from nsm.surfaces import Surface
 from nsm.sweeps import is_complete
-from nsm.tasks.several import Parted
+from nsm.tasks.ensemble import EnsembleSplit
 
 Call = tuple[dict[str, Any], str, str]  # settings, folder and cwd, as for run_job
 Ended = tuple[int, "str | None"]  # number of a job, and why it failed
@@ -71,7 +71,7 @@ class _Job:
         return self.number, run_job(*self.call, log=False)
 
 
-def run_together(calls: Sequence[Call]) -> Iterator[Ended]:
+def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
     """Run jobs with :func:`nsm.pipeline.overfit.common_settings` in one batch.
 
     Those that cannot be prepared fail alone. What is not at the same step as the others, or goes
@@ -79,7 +79,7 @@ def run_together(calls: Sequence[Call]) -> Iterator[Ended]:
 
     Args:
         calls: of each job, settings, folder and working folder, as for
-            :func:`nsm.pipeline.jobs.run_job`.
+            :func:`nsm.pipeline.sweep_jobs.run_job`.
 
     Yields:
         The number of each job as it ends, and why it failed, in one line, or None.
@@ -95,7 +95,7 @@ def run_together(calls: Sequence[Call]) -> Iterator[Ended]:
             settings, place = call[0], Path(call[1])
             lock = locks.enter_context(ExitStack())
             try:
-                lock.enter_context(alone(place))
+                lock.enter_context(folder_lock(place))
             except NsmError as told:  # another process is at work on it
                 yield number, str(told)
                 continue
@@ -135,14 +135,14 @@ def _ready(
 def _train(jobs: list[_Job], console: Console, started: float) -> Iterator[Ended]:
     while len(jobs) > 1:
         try:
-            modules, trainer = overfit_together(
+            modules, trainer = overfit_ensemble(
                 [job.run for job in jobs], [job.surface for job in jobs], console
             )
             break
         except Exception as fault:
             # whatever it is, the job that it concerns will say it again
             reason = " ".join(str(fault).split())[:200]
-            which = fault.which if isinstance(fault, Parted) else range(len(jobs))
+            which = fault.which if isinstance(fault, EnsembleSplit) else range(len(jobs))
             console.print(f"{reason}; {len(which)} of {len(jobs)} jobs go on alone")
             yield from (jobs[i].alone() for i in which)
             left = [job for i, job in enumerate(jobs) if i not in which]
