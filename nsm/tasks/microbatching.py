@@ -34,8 +34,8 @@ class Microbatching(pl.LightningModule):
     that of the whole batch, also where it is no sum over points.
 
     Attributes:
-        microbatches: how many parts a batch is evaluated in; in the checkpoint, so that a resumed training
-            goes on the same way.
+        microbatches: how many parts a batch is evaluated in; kept in the checkpoint, so that a
+            resumed training goes on the same way.
     """
 
     microbatches: int = 1

@@ -1,0 +1,113 @@
+"""Make objects of settings with ``_target_``: freely for the user's own, by a list for others'.
+
+Settings that a user composes (command line, conf folder, Python) name any importable class, as
+Hydra's users know it. Settings in a file that may come from a stranger (a run folder, a saved
+surface) are instantiated by :func:`instantiate_stored` alone: it makes classes of nsm, those of
+torch on a short list, and those of modules that the user says to trust.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
+
+from nsm.errors import NotTrusted, NsmError
+
+# rooms whose classes only compute: making one reads and writes no file
+_ROOMS = ("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.extensions")
+_TORCH_MODULES = ("torch.nn.modules.activation", "torch.optim", "torch.optim.lr_scheduler")
+_TORCH_NAMES = ("torch.nn.", "torch.optim.")
+_LOGGERS = ("nsm.results.loggers",)
+
+
+def made(config: Any, *args: Any, **kwargs: Any) -> Any:
+    """The object that a user's settings name, by ``hydra.utils.instantiate``.
+
+    Args:
+        config: a mapping with ``_target_``; nested ones are made first.
+        args, kwargs: further arguments of the target.
+
+    Raises:
+        NsmError: the target cannot be imported, or refuses its arguments. What a user's own code
+            raises beyond ValueError and TypeError passes through.
+    """
+    target = str(config.get("_target_")) if isinstance(config, Mapping) or config else ""
+    try:
+        return instantiate(config, *args, _convert_="all", **kwargs)
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, NsmError):
+            raise cause from None
+        if isinstance(cause, (ValueError, TypeError, ImportError, AttributeError)):
+            reason = " ".join(str(cause).split())
+            raise NsmError(f"{target}: {reason}", kind="not_instantiable", key=target) from error
+        raise cause from error
+
+
+def is_trusted(target: str, trust: Iterable[str] = ()) -> bool:
+    """Whether a stored ``_target_`` may be made: nsm's, torch's by the list, or a trusted module's.
+
+    Nothing is imported to find out but modules of nsm, torch and those trusted; a path that reaches
+    another module through an import of an allowed one is refused.
+    """
+    if any(target == module or target.startswith(f"{module}.") for module in trust):
+        return True
+    homes: tuple[str, ...]
+    if target.startswith(tuple(f"{room}." for room in (*_ROOMS, *_LOGGERS))):
+        homes = (*_ROOMS, *_LOGGERS)
+    elif target.startswith(_TORCH_NAMES):
+        homes = _TORCH_MODULES
+    else:
+        return False
+    module, _, name = target.rpartition(".")
+    try:
+        thing = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    home = getattr(thing, "__module__", None)
+    if not inspect.isclass(thing) and not inspect.isfunction(thing):
+        return False
+    return isinstance(home, str) and any(home == h or home.startswith(f"{h}.") for h in homes)
+
+
+def instantiate_stored(config: Any, *args: Any, trust: Iterable[str] = (), **kwargs: Any) -> Any:
+    """As :func:`made`, of settings that may be a stranger's.
+
+    Raises:
+        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within.
+        NsmError: as :func:`made`.
+    """
+    check_trusted(config, trust)
+    return made(config, *args, **kwargs)
+
+
+def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
+    """NotTrusted for stored settings in which a target is not to be trusted."""
+    trust = tuple(trust)
+    if isinstance(config, Mapping):
+        if "_target_" in config and not is_trusted(str(config["_target_"]), trust):
+            raise NotTrusted(str(config["_target_"]))
+        for value in config.values():
+            check_trusted(value, trust)
+    elif isinstance(config, (list, tuple)):
+        for value in config:
+            check_trusted(value, trust)
+
+
+def target_of(kind: Any) -> str:
+    """The ``_target_`` of a class or function: where it can be imported from."""
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def named_object(target: str) -> Any:
+    """The class or function of a user's ``_target_``; NsmError if it cannot be imported."""
+    try:
+        return get_object(target)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise NsmError(f"{target}: {reason}", kind="not_importable", key=target) from error
