@@ -32,18 +32,18 @@ class Surface:
     """A mesh cut to a disc, normalised, and parameterised injectively into Ω.
 
     Attributes:
-        name: what it is called in logs and file names.
+        name: in logs and file names.
         vertices: (V, 3) float64, centred, scaled so that the area is that of Ω (π or 4).
         faces: (F, 3) int64, counter-clockwise in Ω.
         uv: (V, 2) float64 in Ω, without flipped triangles.
         domain: Ω.
         source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
-        cut_vertex: (W,) int64, of each vertex of the mesh file the first vertex here that it, or
-            the one that it was merged with, became; or -1 if it is not on the surface.
-        seam_pairs: (T, 2) int64, pairs of vertices on the seam that were one point.
+        cut_vertex: (W,) int64, for each vertex of the mesh file its first copy here (or that of
+            the vertex it was merged with); -1 if it is not on the surface.
+        seam_pairs: (T, 2) int64, pairs of vertices on the seam that are one point of the mesh.
         scale, center: ``vertices = (original - center) * scale``.
         quality: figures of the preparation (see :meth:`from_arrays`).
-        log: what was repaired, converted or cut, a line each.
+        log: repairs, conversions and cuts, a line each.
     """
 
     name: str
@@ -74,8 +74,8 @@ class Surface:
         Args:
             path_or_name: an OBJ, PLY, OFF, STL, GLTF or GLB file, or a catalogue name.
             domain: Ω, or the name of one of :data:`nsm.domains.DOMAINS`.
-            seam_vertices: vertices (numbers in the file) that the seam of the cut passes through;
-                without them, mutually far points are chosen where a seam is needed.
+            seam_vertices: vertices (numbers in the file) that the seam passes through; by default
+                mutually far ones where a seam is needed.
             parameterization: ``slim`` or ``tutte``.
             cache: keep the prepared surface on disk, keyed by content.
 
@@ -124,8 +124,8 @@ class Surface:
 
         ``quality`` holds flipped_triangles, boundary_self_intersections (both 0, or this raises),
         median_symmetric_dirichlet and tutte_median_symmetric_dirichlet (of the map from Ω to the
-        mesh; Tutte's of a large mesh is that of the coarse one that it is laid out by),
-        seam_vertices (how many doubled vertices) and seconds.
+        mesh; for large meshes, Tutte's of the coarse mesh), seam_vertices (the number of
+        ``seam_pairs``) and seconds.
 
         Raises:
             NsmError: the mesh cannot be repaired, cut or flattened without flips.
@@ -167,8 +167,14 @@ class Surface:
                     )
             seam = [int(mesh.merged[v]) for v in seam]
         cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
-        words = (*log, *mesh.log)
-        return cls.from_cut(cut, mesh, name=name, domain=domain, parameterization=method, log=words)
+        return cls.from_cut(
+            cut,
+            mesh,
+            name=name,
+            domain=domain,
+            parameterization=method,
+            log=(*log, *mesh.log),
+        )
 
     @classmethod
     def from_cut(
@@ -236,8 +242,8 @@ class Surface:
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
-        """The arrays that :meth:`from_stored` makes the surface of, but for name and domain."""
-        words = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
+        """The arrays from which :meth:`from_stored` makes the surface, given name and domain."""
+        details = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
         return {
             "vertices": self.vertices,
             "faces": self.faces,
@@ -246,13 +252,13 @@ class Surface:
             "cut_vertex": self.cut_vertex,
             "seam_pairs": self.seam_pairs,
             "center": self.center,
-            "words": np.frombuffer(words.encode(), dtype=np.uint8),
+            "words": np.frombuffer(details.encode(), dtype=np.uint8),
         }
 
     @classmethod
     def from_stored(cls, name: str, domain: str | Domain, stored: dict[str, np.ndarray]) -> Surface:
         """The surface of arrays that :meth:`to_stored` gave."""
-        words: dict[str, Any] = json.loads(stored["words"].tobytes())
+        details: dict[str, Any] = json.loads(stored["words"].tobytes())
         return cls(
             name=name,
             vertices=stored["vertices"],
@@ -262,10 +268,10 @@ class Surface:
             source_vertex=stored["source_vertex"],
             cut_vertex=stored["cut_vertex"],
             seam_pairs=stored["seam_pairs"],
-            scale=words["scale"],
+            scale=details["scale"],
             center=stored["center"],
-            quality=words["quality"],
-            log=(*words["log"], "prepared surface taken from the cache"),
+            quality=details["quality"],
+            log=(*details["log"], "prepared surface taken from the cache"),
         )
 
     @property
@@ -282,7 +288,7 @@ class Surface:
         return digest.hexdigest()[:32]
 
     def preimages(self, vertex_ids: Sequence[int]) -> np.ndarray:
-        """Points (L, 2) of Ω of vertices of the mesh file; of a seam vertex, its first copy.
+        """Points (L, 2) of Ω for vertices of the mesh file; for a seam vertex, its first copy.
 
         Raises:
             NsmError: a vertex that the file does not have, or that was removed as bad.
@@ -290,8 +296,7 @@ class Surface:
         return self.uv[self._found(vertex_ids)]
 
     def kept(self, vertex_ids: Sequence[int]) -> np.ndarray:
-        """Vertices (L,) of the mesh file as ``source_vertex`` has them: merged ones by the vertex
-        that they were merged with.
+        """Vertices (L,) as in ``source_vertex``: merged ones as the vertex they were merged with.
 
         Raises:
             NsmError: as :meth:`preimages`.
@@ -319,7 +324,7 @@ def as_it_lies(
     domain: str | Domain,
     seam_pairs: np.ndarray | None = None,
 ) -> Surface:
-    """A disc that is laid out already, in its own units and place; nothing is checked."""
+    """A surface from a mesh that is laid out already, not scaled and not checked."""
     return Surface(
         name=name,
         vertices=vertices,
@@ -335,7 +340,7 @@ def as_it_lies(
 
 
 def _numbers(given: Any, what: str) -> list[int]:
-    """Vertex numbers; NsmError for anything else than a list of whole numbers."""
+    """Vertex numbers; NsmError for anything but a list of whole numbers."""
     numbers = listed(given, what)
     if not isinstance(numbers, list):
         raise NsmError(f"{what}: give vertex numbers", kind="wrong_type", key=what)
