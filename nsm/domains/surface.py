@@ -26,6 +26,8 @@ from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.validation import CleanMesh, clean
 
+ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -33,7 +35,7 @@ class Surface:
 
     Attributes:
         name: in logs and file names.
-        vertices: (V, 3) float64, centred, scaled so that the area is that of Ω (π or 4).
+        vertices: (V, 3) float64, centred, scaled so that the area is that of Ω.
         faces: (F, 3) int64, counter-clockwise in Ω.
         uv: (V, 2) float64 in Ω, without flipped triangles.
         domain: Ω.
@@ -139,42 +141,21 @@ class Surface:
         stored = cache_.read(key) if cache else None
         if stored is not None:
             return cls.from_stored(name, domain, stored)
-        surface = cls._prepare(vertices, faces, name, domain, seam, parameterization, log)
-        if cache:
-            cache_.write(key, surface.to_stored())
-        return surface
-
-    @classmethod
-    def _prepare(
-        cls,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        name: str,
-        domain: Domain,
-        seam: list[int] | None,
-        method: str,
-        log: Sequence[str],
-    ) -> Surface:
         mesh = clean(vertices, faces, name)
         if seam is not None:
-            for v in seam:
-                if not 0 <= v < len(mesh.merged) or mesh.merged[v] < 0:
-                    raise NsmError(
-                        f"{name}: seam vertex {v} is not on the mesh "
-                        f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices",
-                        kind="not_on_surface",
-                        key="seam_vertices",
-                    )
-            seam = [int(mesh.merged[v]) for v in seam]
+            seam = _merged(seam, mesh, name)
         cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
-        return cls.from_cut(
+        surface = cls.from_cut(
             cut,
             mesh,
             name=name,
             domain=domain,
-            parameterization=method,
+            parameterization=parameterization,
             log=(*log, *mesh.log),
         )
+        if cache:
+            cache_.write(key, surface.to_stored())
+        return surface
 
     @classmethod
     def from_cut(
@@ -244,16 +225,8 @@ class Surface:
     def to_stored(self) -> dict[str, np.ndarray]:
         """The arrays from which :meth:`from_stored` makes the surface, given name and domain."""
         details = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
-        return {
-            "vertices": self.vertices,
-            "faces": self.faces,
-            "uv": self.uv,
-            "source_vertex": self.source_vertex,
-            "cut_vertex": self.cut_vertex,
-            "seam_pairs": self.seam_pairs,
-            "center": self.center,
-            "words": np.frombuffer(details.encode(), dtype=np.uint8),
-        }
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        return {**arrays, "words": np.frombuffer(details.encode(), dtype=np.uint8)}
 
     @classmethod
     def from_stored(cls, name: str, domain: str | Domain, stored: dict[str, np.ndarray]) -> Surface:
@@ -261,17 +234,11 @@ class Surface:
         details: dict[str, Any] = json.loads(stored["words"].tobytes())
         return cls(
             name=name,
-            vertices=stored["vertices"],
-            faces=stored["faces"],
-            uv=stored["uv"],
             domain=domain_of(domain),
-            source_vertex=stored["source_vertex"],
-            cut_vertex=stored["cut_vertex"],
-            seam_pairs=stored["seam_pairs"],
             scale=details["scale"],
-            center=stored["center"],
             quality=details["quality"],
             log=(*details["log"], "prepared surface taken from the cache"),
+            **{name: stored[name] for name in ARRAYS},
         )
 
     @property
@@ -345,3 +312,16 @@ def _numbers(given: Any, what: str) -> list[int]:
     if not isinstance(numbers, list):
         raise NsmError(f"{what}: give vertex numbers", kind="wrong_type", key=what)
     return numbers
+
+
+def _merged(seam: list[int], mesh: CleanMesh, name: str) -> list[int]:
+    """Seam vertices of the mesh file as vertices of the cleaned mesh, or NsmError."""
+    for vertex in seam:
+        if not 0 <= vertex < len(mesh.merged) or mesh.merged[vertex] < 0:
+            raise NsmError(
+                f"{name}: seam vertex {vertex} is not on the mesh "
+                f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices",
+                kind="not_on_surface",
+                key="seam_vertices",
+            )
+    return mesh.merged[np.array(seam, dtype=np.int64)].tolist()
