@@ -10,6 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nsm.config import compose_config
+from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
 from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
 from nsm.pipeline.folder_lock import folder_lock
@@ -24,7 +25,6 @@ from nsm.results import (
     load_surface_map,
 )
 from nsm.run_directories import passing_folder
-from nsm.surfaces import Surface
 from nsm.sweeps import is_complete
 
 

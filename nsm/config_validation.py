@@ -19,16 +19,16 @@ from typing import Any, Union
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from nsm.domains import DOMAINS
+from nsm.domains.common_seams import SEAMS
+from nsm.domains.embedding import METHODS
 from nsm.energies import ENERGIES, Blend
-from nsm.energies.constraints import DOMAINS
 from nsm.errors import NsmError
 from nsm.maps import build_map
 from nsm.maps.activations import ACTIVATIONS
 from nsm.maps.encodings import ENCODINGS
 from nsm.maps.networks import BLOCKS, INITIALIZATIONS, LINEAR_SKIPS
 from nsm.results.loggers import LOGGERS, require
-from nsm.surfaces.correspondence import SEAMS
-from nsm.surfaces.parameterization import METHODS
 from nsm.tasks import Overfit, Param
 from nsm.tasks.constrained import BOUNDARIES, LANDMARKS, Constraints
 from nsm.tasks.optimizers import OPTIMIZERS, SCHEDULERS, build_optimizer, build_scheduler

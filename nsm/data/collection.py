@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 from nsm.data.overfit import HELD_OUT_SEED, Steps
 from nsm.data.sampling import SurfaceSampler
 from nsm.data.shard import Shard
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 
 
 class CollectionData(pl.LightningDataModule):

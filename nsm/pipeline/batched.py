@@ -15,6 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from nsm.config import register_resolvers
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.pipeline.common import (
     Run,
@@ -26,7 +27,6 @@ from nsm.pipeline.common import (
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.overfit import common_settings, leave_results, overfit_ensemble
 from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_config, run_job
-from nsm.surfaces import Surface
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit
 

@@ -14,6 +14,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.data import CollectionData
+from nsm.domains import bounded
+from nsm.domains.joint_preparation import Matched, matched_landmarks
 from nsm.errors import NsmError
 from nsm.pipeline.certification import certified
 from nsm.pipeline.common import built, fitted, frozen, plain, say_where, with_map, write_figures
@@ -33,8 +35,6 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.results.metrics import evaluate
-from nsm.surfaces.joint_preparation import Matched, matched_landmarks
-from nsm.surfaces.shapes import grid_mesh, ring_mesh
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -145,12 +145,11 @@ def build_collection_map(
         ]
     )
     points = (targets @ turns).mean(dim=0)  # each turned back, R⁻¹ = Rᵀ
-    order = 2 if config.domain == "disc" else float("inf")
-    rim = points[: matched.on_boundary]
-    points[: matched.on_boundary] = rim / torch.linalg.vector_norm(rim, order, dim=1)[:, None]
+    on_boundary = points[: matched.on_boundary]
+    points[: matched.on_boundary] = bounded(config.domain).to_boundary(on_boundary)
     # no h_i may fold a triangle of any surface, as F_{i→j} takes those of i through h_j; nor fold
     # anywhere between them, where samples are rare, or its inverse would be lost
-    even, even_faces = ring_mesh(_RINGS) if config.domain == "disc" else grid_mesh(2 * _RINGS)
+    even, even_faces = bounded(config.domain).mesh(_RINGS)
     vertices = [
         torch.as_tensor(phi.surface.uv, dtype=torch.float32) @ turn
         for phi, turn in zip(phis, turns, strict=True)
@@ -162,7 +161,7 @@ def build_collection_map(
     mesh = (torch.cat(vertices), torch.as_tensor(faces))
     cut = all(len(phi.surface.seam_pairs) for phi in phis) and matched.on_boundary >= 2
     common = Matched([points.double().numpy()], matched.numbers, matched.on_boundary)
-    seam = common.seam(config.domain, _SEAM_POINTS) if cut else np.zeros((0, 2, 2))
+    seam = common.seam(bounded(config.domain), _SEAM_POINTS) if cut else np.zeros((0, 2, 2))
     module = built(
         config,
         lambda settings: CollectionMap(

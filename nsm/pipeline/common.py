@@ -23,6 +23,7 @@ from torch.multiprocessing.spawn import ProcessRaisedException
 
 from nsm.config import PRECISIONS, checked, read_config
 from nsm.data import OverfitData
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.pipeline.processes import Process, shared_steps, take_over, told_by
 from nsm.results import atomic_write
@@ -33,7 +34,6 @@ from nsm.results.loggers import Distributed, build_loggers, close, log_figures, 
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
 from nsm.run_directories import is_passing
-from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble

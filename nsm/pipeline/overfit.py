@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.data import EnsembleData
+from nsm.domains import Surface
 from nsm.maps.networks import SKIPS
 from nsm.pipeline.common import (
     Run,
@@ -39,7 +40,6 @@ from nsm.results import (
     save_surface,
 )
 from nsm.results.callbacks import Pictures
-from nsm.surfaces import Surface
 from nsm.tasks import Overfit, OverfitEnsemble
 from nsm.tasks.ensemble import Ensemble
 from nsm.tasks.least_squares import fit_linear_skip

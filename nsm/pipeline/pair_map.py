@@ -14,6 +14,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from nsm.domains import bounded
+from nsm.domains.joint_preparation import Matched, matched_landmarks
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.certification import certified
 from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
@@ -33,7 +35,6 @@ from nsm.results import (
 )
 from nsm.results.callbacks import Pictures
 from nsm.results.metrics import evaluate
-from nsm.surfaces.joint_preparation import Matched, matched_landmarks
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -144,9 +145,9 @@ def build_pair_map(
     else:
         some = uv[:: len(uv) // 4096 + 1]
         turn = least_distorting_rotation(config.domain, phi.map, psi.map, some)
-    if config.domain == "square" and config.constraints["boundary"] == "penalty":
+    if len(bounded(config.domain).corners) and config.constraints["boundary"] == "penalty":
         # the exact boundary keeps corners by construction; here they are key points (METHOD)
-        corners = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        corners = torch.from_numpy(bounded(config.domain).corners).to(p)
         p, q = torch.cat([p, corners]), torch.cat([q, corners @ turn.T])
     return built(
         config,

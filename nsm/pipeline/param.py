@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
+from nsm.domains.baselines import BASELINES
 from nsm.pipeline.certification import certified
 from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
 from nsm.pipeline.surface_cache import neural_surface
@@ -25,7 +26,6 @@ from nsm.results import (
     planar_metrics,
 )
 from nsm.results.callbacks import Pictures
-from nsm.surfaces.baselines import BASELINES
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 

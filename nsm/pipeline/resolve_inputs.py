@@ -11,14 +11,14 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.console import Console
 
+from nsm.domains import Surface
+from nsm.domains.joint_preparation import Mesh, prepare_jointly
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
 from nsm.pipeline.common import accelerator_of, report_surface
 from nsm.pipeline.surface_cache import made_batched
 from nsm.results import NeuralSurface, analytic_surface, load_surface
-from nsm.surfaces import Surface
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.joint_preparation import Mesh, prepare_jointly
 from nsm.surfaces.landmarks import (
     Landmarks,
     as_lists,
@@ -68,7 +68,7 @@ def read_shape(given: Any, domain: str, key: str) -> Shape:
             return Mesh(Path(word).stem, vertices, faces, tuple(log))
         else:
             return Mesh(word, *catalogue_mesh(word))
-    if ready.surface.domain != domain:
+    if str(ready.surface.domain) != domain:
         raise NsmError(
             f"{key}={ready.surface.name}: it lies on the {ready.surface.domain}, but domain="
             f"{domain}; all surfaces of a map need one domain"

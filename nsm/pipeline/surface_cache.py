@@ -15,11 +15,11 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.config import compose_config
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.pipeline.common import CHECKPOINT_FILE, Run, configured_surface, plain, report_surface
 from nsm.pipeline.overfit import common_settings, leave_results, overfit_ensemble, overfitted
 from nsm.results import NeuralSurface, load_surface
-from nsm.surfaces import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit
@@ -53,7 +53,7 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
     """
     if config.phi.path is not None:
         phi = load_surface(config.phi.path)
-        if phi.surface.domain != config.domain:
+        if str(phi.surface.domain) != config.domain:
             raise NsmError(
                 f"{config.phi.path}: its domain is the {phi.surface.domain}, but domain="
                 f"{config.domain}; give domain={phi.surface.domain}"

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nsm.domains import bounded
 from nsm.energies import Blend, inside, landmark
-from nsm.tasks.boundary_samples import boundary_samples
 from nsm.tasks.fold_barrier import carefully, stronger
 from nsm.tasks.optimizers import configure
 from nsm.tasks.terms import Distortion, HeldOut, Term
@@ -105,7 +105,8 @@ class ConstrainedMap(Training):
         """Take landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point."""
         named = {"points": points, "targets": targets, "start": start, "seam": seam}
-        for name, tensor in {**named, "rim": boundary_samples(self.domain)}.items():
+        named["boundary_samples"] = bounded(self.domain).boundary_samples()
+        for name, tensor in named.items():
             self.register_buffer(name, tensor, persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
 

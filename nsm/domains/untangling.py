@@ -1,9 +1,9 @@
-"""Flat meshes whose few flipped triangles are turned back by moving the vertices around them.
+"""Local untangling: turn the few flipped triangles of a flat mesh back.
 
 The energy is that of Garanzha et al. 2021 ("Foldover-free maps in 50 lines of code"): distortion
-over a smoothed determinant, which is finite on flipped triangles and drives their areas up until
-all are positive. It is minimised around each flip alone, over as many rings of triangles as it
-takes; the rest of the mesh stays as it is.
+over a smoothed determinant, finite on flipped triangles, which drives all areas above zero. It is
+minimised around each flip alone, over as many rings of triangles as necessary; the rest of the
+mesh does not move.
 """
 
 from __future__ import annotations
@@ -13,40 +13,20 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from nsm.surfaces.domain import at_fractions, fractions_of
-from nsm.surfaces.predicates import orientation
+from nsm.domains.planar_mesh import cross, flipped, signed_areas
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
-# of the area that a triangle should have: what is smaller could flip by the next rounding
+# of the area that a triangle should have: smaller ones could flip by rounding
 _ROOM = 1e-6
-# of the distance that two neighbours on the boundary have before the map: kept after it
+# of the distance of two boundary neighbours before the map: the least after it
 _GAP = 0.02
-
-
-def flipped(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Mask (F,) of the triangles of a flat mesh (V, 2) that are not counter-clockwise, exactly."""
-    a, b, c = (uv[faces[:, k]] for k in range(3))
-    return orientation(a, b, c) <= 0
-
-
-def order_violations(points: np.ndarray) -> int:
-    """How often a closed polygon (B, 2) fails to go once around the origin, counter-clockwise.
-
-    Zero, by exact signs, means that each side is seen counter-clockwise from the origin and that
-    the turns add up to one: the polygon is then star-shaped, so it does not cross itself.
-    """
-    following = np.roll(points, -1, axis=0)
-    backward = orientation(points, following, np.zeros(2)) <= 0
-    angle = np.arctan2(points[:, 1], points[:, 0])
-    turns = np.mod(np.roll(angle, -1) - angle, 2 * np.pi)[~backward].sum() / (2 * np.pi)
-    return int(backward.sum()) or abs(round(turns) - 1)
 
 
 def untangled(
     rest: np.ndarray, faces: np.ndarray, image: np.ndarray, fixed: np.ndarray
 ) -> np.ndarray:
-    """The image of a flat mesh, with its flipped triangles turned back where that can be done.
+    """The image of a flat mesh, with its flipped triangles turned back where possible.
 
     Args:
         rest: (V, 2) the mesh before it is mapped, no triangle of it flipped.
@@ -55,8 +35,8 @@ def untangled(
         fixed: (V,) mask of vertices that may not move.
 
     Returns:
-        (V, 2): ``image``, but for vertices near a flip, which are as near as can be to where the
-        local affine map has them. Flips that remain are for the caller to count.
+        (V, 2): ``image``, except for vertices near a flip, which follow the local affine map as
+        closely as possible. The caller counts flips that remain.
     """
     image = np.array(image, dtype=np.float64)
     for rings in _RINGS:
@@ -75,7 +55,7 @@ def untangled(
 
 
 def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.ndarray]:
-    """The faces (P, 3) around each group of free vertices that hang together, with a flip each."""
+    """The faces (P, 3) around each connected group of free vertices that has a flip."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     edges = edges[free[edges].all(axis=1)]
     edges = np.concatenate([edges, faces[:, [2, 0]][free[faces[:, [2, 0]]].all(axis=1)]])
@@ -88,24 +68,21 @@ def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.nd
 
 
 def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndarray) -> None:
-    """Move free vertices of a patch (P, 3) within ``image``, if that leaves none of it flipped."""
+    """Move free vertices of a patch (P, 3) in ``image``, if that leaves no flip in the patch."""
     vertices = np.unique(faces)
     affine = _affine_fit(rest[vertices], image[vertices])
     if affine is None:
         return
-    a, b, c = (rest[faces[:, k]] @ affine.T for k in range(3))
-    shape = np.stack([b - a, c - a], axis=2)
-    with np.errstate(all="ignore"):
-        area = np.linalg.det(shape)
-        if not (area > 0).all():
-            return
-        inverse = np.linalg.inv(shape)
+    shape = rest @ affine.T
+    area = signed_areas(shape, faces)
+    if not (area > 0).all():
+        return
+    inverse = _cofactors(_sides(shape, faces)).transpose(0, 2, 1) / (2 * area[:, None, None])
     moving = vertices[free[vertices]]
     trial = image.copy()
 
     def determinants() -> np.ndarray:
-        p, q, r = (trial[faces[:, k]] for k in range(3))
-        return np.linalg.det(np.stack([q - p, r - p], axis=2)) / area
+        return signed_areas(trial, faces) / area
 
     least = determinants().min()
     for _ in range(_ROUNDS):
@@ -134,10 +111,22 @@ def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndar
 
 
 def _affine_fit(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
-    """The matrix (2, 2) that best takes points (N, 2) to others, if it keeps the orientation."""
+    """The least-squares linear map (2, 2) between centred points, or None if it reflects."""
     x, y = before - before.mean(axis=0), after - after.mean(axis=0)
     matrix = np.linalg.lstsq(x, y, rcond=None)[0].T
     return matrix if np.linalg.det(matrix) > 0 else None
+
+
+def _sides(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Matrices (F, 2, 2) whose columns are two sides of each triangle."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.stack([b - a, c - a], axis=2)
+
+
+def _cofactors(matrices: np.ndarray) -> np.ndarray:
+    """The derivatives (F, 2, 2) of determinants by the entries of matrices (F, 2, 2)."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0)
+    return np.stack([np.stack([d, -c], axis=1), np.stack([-b, a], axis=1)], axis=1)
 
 
 def _energy(
@@ -147,23 +136,15 @@ def _energy(
 
     χ(d) = (d + √(ε² + d²)) / 2 is positive, whatever d is.
     """
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    jacobian = np.stack([b - a, c - a], axis=2) @ inverse
-    d = np.linalg.det(jacobian)
+    jacobian = _sides(points, faces) @ inverse
+    d = cross(jacobian[:, :, 0], jacobian[:, :, 1])
     root = np.sqrt(epsilon**2 + d**2)
     # for d < 0 the difference would cancel
     chi = np.where(d > 0, 0.5 * (d + root), 0.5 * epsilon**2 / (root - np.minimum(d, 0)))
     slope = chi / root
     top = (jacobian**2).sum(axis=(1, 2)) + d**2 + 1
-    cofactor = np.stack(
-        [
-            np.stack([jacobian[:, 1, 1], -jacobian[:, 1, 0]], axis=1),
-            np.stack([-jacobian[:, 0, 1], jacobian[:, 0, 0]], axis=1),
-        ],
-        axis=1,
-    )
     by_d = (2 * d - top * slope / chi) / chi
-    force = 2 * jacobian / chi[:, None, None] + by_d[:, None, None] * cofactor
+    force = 2 * jacobian / chi[:, None, None] + by_d[:, None, None] * _cofactors(jacobian)
     edges = force @ inverse.transpose(0, 2, 1)  # columns: by b - a and by c - a
     gradient = np.zeros_like(points)
     np.add.at(gradient, faces[:, 1], edges[:, :, 0])
@@ -172,38 +153,33 @@ def _energy(
     return float((top / chi).sum()), gradient
 
 
-def in_order(points: np.ndarray, rest: np.ndarray, domain: str) -> np.ndarray:
-    """Points of ∂Ω (B, 2), moved along it into the order of a loop where they are not.
+def order_shifts(now: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far the points of a loop must move along a closed curve to be in order.
 
-    The nearest increasing fractions of the way around ∂Ω (isotonic regression) take their place,
-    at distances of at least a small share of what they are before the map.
+    The nearest increasing fractions (isotonic regression) keep distances of at least a small share
+    of those before the map.
 
     Args:
-        points: where a map sends the loop's vertices, which should go around Ω once.
-        rest: (B, 2) where they are before, in order.
-        domain: ``disc`` or ``square``.
+        now: (B,) fractions of the way around, where a map sends the loop's vertices.
+        before: (B,) rising fractions before the map.
 
     Returns:
-        (B, 2); equal to ``points`` where these do not go around once, which no small change mends.
+        which points (M,) move, and their shifts (M,); none where the loop does not go around once.
     """
-    before, now = fractions_of(rest, domain), fractions_of(points, domain)
     gap = _GAP * np.mod(np.roll(before, -1) - before, 1.0)
     step = np.mod(np.roll(now, -1) - now + 0.5, 1.0) - 0.5
     if round(step.sum()) != 1:
-        return points
-    # how far around each point is, less the gaps: what should not decrease; over three turns
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    # how far around each point is, less the gaps, should not decrease; over three turns
     turn = 1.0 - gap.sum()
     once = np.concatenate([[0.0], np.cumsum(step - gap)[:-1]])
     along = np.concatenate([once - turn, once, once + turn])
-    # the circle is opened at a point that all points before it are behind, and all after it ahead
+    # the circle is opened at a point ahead of all before it and behind all after it
     highest = np.maximum.accumulate(along)
     lowest = np.minimum.accumulate(along[::-1])[::-1]
     n = len(now)
     first = int(np.argmin((highest - lowest)[n : 2 * n]))
     piece = along[n + first : 2 * n + first]
     better = isotonic_regression(piece).x.clip(piece[0], piece[0] + turn)
-    index = (first + np.flatnonzero(better != piece)) % n
-    result = points.copy()
-    shift = (better - piece)[better != piece]
-    result[index] = at_fractions(np.mod(now[index] + shift, 1.0), domain)
-    return result
+    moved = better != piece
+    return (first + np.flatnonzero(moved)) % n, (better - piece)[moved]

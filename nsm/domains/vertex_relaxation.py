@@ -1,18 +1,23 @@
-"""Flat meshes whose vertices move one by one to where their triangles are least distorted.
+"""Relaxation of a flat mesh, vertex by vertex, to less distorted triangles.
 
-The energy is that of :mod:`nsm.surfaces.sliding`: symmetric Dirichlet, weighted by the
-area on the mesh. Vertices that are no neighbours move at once; a step that would flip a triangle
-or not lower the energy is shortened, or not made.
+The energy is that of :mod:`nsm.domains.sliding`: symmetric Dirichlet, weighted by area on the
+mesh. Vertices that are not neighbours move at once. A step that would flip a triangle or not lower
+the energy is shortened, and in the end skipped.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nsm.domains.decimation import Rings
+from nsm.domains.planar_mesh import cross, symmetric_dirichlet
 from nsm.surfaces import topology
-from nsm.surfaces.coarsening import Rings
+
+if TYPE_CHECKING:
+    from nsm.domains.base import BoundedDomain
 
 _TRIES, _SHORTER = 4, 0.35
 _COLOURS = 64
@@ -22,9 +27,10 @@ _COLOURS = 64
 class Stars:
     """The triangles around some vertices (N,), no two of which are neighbours.
 
-    For each of M corners at them: star (M,), whose it is; b and c (M,), the triangle's others,
-    counter-clockwise; and of its shape on the mesh, a = |g|²A, e = g·g_c A, f = |g_c|²A, with the
-    gradients g, g_c of the hat functions and the area A, and d = 1 / 2A.
+    For each of M corners at them: star (M,), which vertex it belongs to; b and c (M,), the
+    triangle's other vertices, counter-clockwise; and of its shape on the mesh, a = |g|²A,
+    e = g·g_c A, f = |g_c|²A, with the gradients g, g_c of the hat functions and the area A, and
+    d = 1 / 2A.
     """
 
     vertex: np.ndarray
@@ -62,8 +68,8 @@ class Stars:
             1 / double,
         )
 
-    def chosen(self, keep: np.ndarray) -> Stars:
-        """Those of the stars that a mask (N,) keeps."""
+    def subset(self, keep: np.ndarray) -> Stars:
+        """The stars that a mask (N,) keeps."""
         corners = keep[self.star]
         number = np.cumsum(keep) - 1
         parts = (getattr(self, name)[corners] for name in ("b", "c", "a", "e", "f", "d"))
@@ -72,28 +78,24 @@ class Stars:
     def energy(self, uv: np.ndarray, at: np.ndarray) -> np.ndarray:
         """Energy (N,) of each star with its vertex at (N, 2); inf where a triangle has no area."""
         x, y = at[self.star] - uv[self.b], uv[self.c] - uv[self.b]
-        det = (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) * self.d
-        return self._sum(np.where(det > 0, self._dirichlet(x, y) * (1 + self._power(det)), np.inf))
+        return self._sum(symmetric_dirichlet(self._norm(x, y), cross(y, x) * self.d))
 
-    def _dirichlet(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def _norm(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """‖J‖² times the area on the mesh (M,), by the sides x = p - b, y = c - b (M, 2)."""
         return (
             self.a * (x * x).sum(axis=1)
             + 2 * self.e * (x * y).sum(axis=1)
             + self.f * (y * y).sum(axis=1)
         )
 
-    @staticmethod
-    def _power(det: np.ndarray) -> np.ndarray:
-        return 1 / np.where(det > 0, det, 1.0) ** 2
-
     def _sum(self, values: np.ndarray) -> np.ndarray:
         return np.bincount(self.star, weights=values, minlength=len(self.vertex))
 
     def derivatives(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Energy (N,), gradient (N, 2) and second derivatives xx, xy, yy (N, 3) as they lie."""
+        """Energy (N,), gradient (N, 2) and second derivatives xx, xy, yy (N, 3) at uv (V, 2)."""
         x, y = uv[self.vertex[self.star]] - uv[self.b], uv[self.c] - uv[self.b]
-        det = (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) * self.d
-        q = self._dirichlet(x, y)
+        det = cross(y, x) * self.d
+        q = self._norm(x, y)
         p2 = 1 / det**2
         p3 = -2 * p2 / det
         q4 = 6 * q * p2**2
@@ -114,53 +116,46 @@ class Stars:
         )
 
 
-class Slopes:
-    """Where vertices may move: freely, or, those of a mask (V,), along ∂Ω; some not at all."""
+@dataclass(frozen=True)
+class Freedom:
+    """Where vertices may move: those of a mask (V,) along ∂Ω, held ones not at all, the others
+    freely."""
 
-    def __init__(self, rim: np.ndarray, held: np.ndarray, domain: str) -> None:
-        self.boundary, self.held, self.domain = rim, held, domain
+    on_boundary: np.ndarray
+    held: np.ndarray
+    domain: BoundedDomain
 
-    def tangent(self, uv: np.ndarray) -> np.ndarray:
-        if self.domain == "disc":
-            return np.stack([-uv[:, 1], uv[:, 0]], axis=1)
-        on_vertical = np.abs(uv[:, 0]) > np.abs(uv[:, 1])
-        return np.stack([~on_vertical, on_vertical], axis=1).astype(np.float64)
-
-    def back(self, points: np.ndarray, rim: np.ndarray) -> np.ndarray:
-        """Points (N, 2), those of a mask (N,) brought back to ∂Ω."""
-        on = points[rim]
-        if self.domain == "disc":
-            points[rim] = on / np.linalg.norm(on, axis=1, keepdims=True)
-        else:
-            points[rim] = on.clip(-1.0, 1.0)
+    def retract(self, points: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Points (N, 2), changed in place: those of a mask (N,) are brought back to ∂Ω."""
+        points[which] = self.domain.retract(points[which])
         return points
 
 
-def relax(uv: np.ndarray, stars: Stars, slopes: Slopes) -> None:
+def relax(uv: np.ndarray, stars: Stars, freedom: Freedom) -> None:
     """One Newton step of each of the stars' vertices, within uv (V, 2)."""
     energy, gradient, second = stars.derivatives(uv)
-    rim, here = slopes.boundary[stars.vertex], uv[stars.vertex]
+    on_boundary, here = freedom.on_boundary[stars.vertex], uv[stars.vertex]
     direction = _newton(gradient, second)
-    if rim.any():
-        t, g, h = slopes.tangent(here[rim]), gradient[rim], second[rim]
+    if on_boundary.any():
+        place, g, h = here[on_boundary], gradient[on_boundary], second[on_boundary]
+        t = freedom.domain.tangents(place)
         along = (g * t).sum(axis=1)
         bend = h[:, 0] * t[:, 0] ** 2 + 2 * h[:, 1] * t[:, 0] * t[:, 1] + h[:, 2] * t[:, 1] ** 2
-        if slopes.domain == "disc":
-            bend = bend - (g * here[rim]).sum(axis=1)
+        bend = bend + (g * freedom.domain.curvature(place)).sum(axis=1)
         bend = np.maximum(bend, 0.1 * np.abs(h[:, 0] + h[:, 2]))
-        direction[rim] = -(along / bend)[:, None] * t
+        direction[on_boundary] = -(along / bend)[:, None] * t
     size = np.minimum(1.0, 0.8 * _first_collapse(uv, stars, direction))
-    active = np.isfinite(direction).all(axis=1) & ~slopes.held[stars.vertex]
-    some, index = stars.chosen(active), np.flatnonzero(active)
+    active = np.isfinite(direction).all(axis=1) & ~freedom.held[stars.vertex]
+    some, index = stars.subset(active), np.flatnonzero(active)
     for _ in range(_TRIES):
         if len(index) == 0:
             return
         trial = here[index] + size[index, None] * direction[index]
-        trial = slopes.back(trial, rim[index])
+        trial = freedom.retract(trial, on_boundary[index])
         better = some.energy(uv, trial) < energy[index]
         uv[some.vertex[better]] = trial[better]
         size[index] *= _SHORTER
-        some, index = some.chosen(~better), index[~better]
+        some, index = some.subset(~better), index[~better]
 
 
 def _newton(gradient: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -180,23 +175,23 @@ def _newton(gradient: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _first_collapse(uv: np.ndarray, stars: Stars, direction: np.ndarray) -> np.ndarray:
     """The multiple (N,) of each step (N, 2) at which a triangle of the star loses its area."""
     x, y = uv[stars.vertex[stars.star]] - uv[stars.b], uv[stars.c] - uv[stars.b]
-    area = y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]
+    area = cross(y, x)
     by = direction[stars.star]
-    change = y[:, 0] * by[:, 1] - y[:, 1] * by[:, 0]
+    change = cross(y, by)
     rate = np.zeros(len(stars.vertex))
     np.maximum.at(rate, stars.star, -change / area)
     return 1 / np.maximum(rate, 1e-300)
 
 
 def sweep(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, slopes: Slopes, sweeps: int
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, freedom: Freedom, sweeps: int
 ) -> None:
     """Relax all vertices that the faces (F, 3) name, one independent set after the other.
 
     Args:
         vertices: (V, 3) the mesh, which should have the area of the domain.
-        uv: (V, 2), not flipped; changed in place.
-        sweeps: how often all are gone through.
+        uv: (V, 2), without flips; changed in place.
+        sweeps: how many times every vertex is relaxed.
     """
     ids, local = topology.renumbered(faces, len(vertices))
     colour = _colours(local[faces], len(ids))
@@ -211,7 +206,7 @@ def sweep(
         groups.append(Stars.of(vertices, members, number[owner[mine]], b[mine], c[mine]))
     for _ in range(sweeps):
         for stars in groups:
-            relax(uv, stars, slopes)
+            relax(uv, stars, freedom)
 
 
 def _colours(faces: np.ndarray, n: int) -> np.ndarray:

@@ -1,0 +1,194 @@
+"""Injective layouts of a disc-shaped mesh over a domain with a convex boundary.
+
+Tutte's embedding comes first: with uniform weights and a convex boundary it is injective for every
+mesh. SLIM (Rabinovich et al. 2017, "Scalable Locally Injective Mappings") then lowers the symmetric
+Dirichlet energy: libigl's with a fixed boundary, which is fast, and after it
+:mod:`nsm.domains.sliding`, whose boundary vertices slide along ∂Ω. The latter keeps the boundary
+exactly on ∂Ω and never flips a triangle, which libigl's soft constraints cannot promise. Large
+meshes are laid out coarse to fine (:mod:`nsm.domains.coarse_to_fine`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nsm.domains.coarse_to_fine import embed_coarse_to_fine
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
+from nsm.domains.sliding import slide
+from nsm.domains.tutte import tutte
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+from nsm.surfaces.geometry import triangle_distortion
+
+if TYPE_CHECKING:
+    from nsm.domains.base import BoundedDomain, Keys
+
+# slim_held: SLIM without the sliding steps, a fast estimate of slim
+METHODS = ("tutte", "slim_held", "slim")
+# meshes with more faces than LARGE are first decimated to COARSE faces
+LARGE, COARSE = 40_000, 12_000
+
+
+@dataclass(frozen=True)
+class Embedding:
+    """A layout over Ω.
+
+    Attributes:
+        uv: (V, 2) in Ω.
+        distortion: median symmetric Dirichlet energy of the map from Ω to the mesh.
+        tutte_distortion: that of Tutte's embedding, of the coarse mesh if there was one.
+        log: fallbacks taken, a line each.
+    """
+
+    uv: np.ndarray
+    distortion: float
+    tutte_distortion: float
+    log: tuple[str, ...]
+
+
+def embed(
+    domain: BoundedDomain,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    method: str = "slim",
+    name: str = "mesh",
+    keys: Keys | None = None,
+) -> Embedding:
+    """Map a disc-shaped mesh (V,3), (F,3) injectively onto the domain.
+
+    The mesh should have the area of the domain. Keys stay in their places.
+
+    Raises:
+        NsmError: ``unknown_option``, an unknown method; ``not_injective``, even Tutte's embedding
+            has flipped triangles in floating point.
+    """
+    check_method(method, name)
+    log: list[str] = []
+    loop = topology.boundary_loops(faces)[0]
+    boundary = domain.place_boundary(vertices, loop, name, keys)
+    held = np.zeros(len(vertices), dtype=bool)
+    held[loop[domain.at_corner(boundary)]] = True
+    if keys is not None:
+        held[keys.vertices] = True
+
+    tutte_distortion = float("nan")
+
+    def solve(
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        loop: np.ndarray,
+        boundary: np.ndarray,
+        held: np.ndarray,
+    ) -> np.ndarray:
+        nonlocal tutte_distortion
+        start = _tutte_start(vertices, faces, loop, boundary, name, log)
+        tutte_distortion = _median_distortion(vertices, faces, start)
+        if method == "tutte":
+            return start
+        uv = _slim_held(vertices, faces, start, loop, boundary, log)
+        steps = _sliding_steps(len(faces)) if method == "slim" else 0
+        uv = slide(vertices, faces, uv, loop, domain, steps, held)
+        if _is_injective(uv, faces, loop):
+            return uv
+        log.append("SLIM's result was not injective: Tutte's embedding kept")
+        return start
+
+    uv = None
+    if method != "tutte" and len(faces) > LARGE:
+        uv = embed_coarse_to_fine(vertices, faces, loop, boundary, domain, held, solve, COARSE)
+        if uv is None or not _is_injective(uv, faces, loop):
+            uv, log[:] = None, ["coarse-to-fine layout failed: whole mesh laid out at once"]
+    if uv is None:
+        uv = solve(vertices, faces, loop, boundary, held)
+    distortion = _median_distortion(vertices, faces, uv)
+    return Embedding(uv, distortion, tutte_distortion, tuple(log))
+
+
+def _is_injective(uv: np.ndarray, faces: np.ndarray, loop: np.ndarray) -> bool:
+    return not (flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop))
+
+
+def check_method(method: str, name: str) -> None:
+    """NsmError for a method that is none of :data:`METHODS`."""
+    if method not in METHODS:
+        raise NsmError(
+            f"{name}: unknown parameterization {method!r}; use one of {', '.join(METHODS)}",
+            kind="unknown_option",
+            key="parameterization",
+        )
+
+
+def _tutte_start(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    loop: np.ndarray,
+    boundary: np.ndarray,
+    name: str,
+    log: list[str],
+) -> np.ndarray:
+    """Tutte's embedding (V,2) without flips, or NsmError."""
+    start = tutte(vertices, faces, loop, boundary)
+    if flipped_triangles(start, faces):
+        start = tutte(vertices, faces, loop, boundary, weights="mean_value")
+        log.append("uniform Tutte weights lost precision: mean value weights used")
+    flipped = flipped_triangles(start, faces)
+    if flipped:
+        raise NsmError(
+            f"{name}: {flipped} triangles flip in Tutte's embedding, as long thin parts exceed "
+            "floating point; give seam_vertices at the tips of long parts",
+            kind="not_injective",
+            key=name,
+        )
+    return start
+
+
+def _slim_held(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    start: np.ndarray,
+    loop: np.ndarray,
+    boundary: np.ndarray,
+    log: list[str],
+) -> np.ndarray:
+    """libigl's SLIM with a softly fixed boundary, moved exactly to ∂Ω without flips."""
+    import igl
+
+    iterations = 30 if len(faces) < 40_000 else 12
+    bc = np.zeros((len(loop), 2))
+    bc[:] = boundary
+    try:
+        data = igl.slim_precompute(
+            np.asfortranarray(vertices, dtype=np.float64),
+            np.asfortranarray(faces, dtype=np.int32),
+            np.asfortranarray(start, dtype=np.float64),
+            igl.SYMMETRIC_DIRICHLET,
+            loop.astype(np.int32),
+            np.asfortranarray(bc),
+            1e5,
+        )
+        solved = np.array(igl.slim_solve(data, iterations))[:, :2]
+    except RuntimeError as error:
+        log.append(f"libigl SLIM failed ({error}): sliding steps start from Tutte's embedding")
+        return start
+    solved[loop] = boundary
+    # shorten the way from Tutte's embedding until nothing flips
+    share = 1.0
+    for _ in range(12):
+        blend = start + share * (solved - start)
+        if np.isfinite(blend).all() and not flipped_triangles(blend, faces):
+            return blend
+        share *= 0.7
+    return start
+
+
+def _sliding_steps(n_faces: int) -> int:
+    """Number of sliding steps, such that they take seconds."""
+    return int(np.clip(800_000 / n_faces, 6, 60))
+
+
+def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:
+    return float(np.median(triangle_distortion(uv, vertices, faces)))
