@@ -26,15 +26,15 @@ class Activation(nn.Module):
     Subclasses answer ``value_and_slope`` and one of ``slope_from_value`` and ``curvature``: where
     f(z) alone tells both derivatives, the forward pass keeps nothing else.
 
-    Args:
-        **parameters: of the activation; with the class they make up ``config``.
     """
 
     from_value: ClassVar[bool] = False  # whether ``slope_from_value`` is there
+    settings: ClassVar[tuple[str, ...]] = ()  # names of the constructor's arguments, all kept
 
-    def __init__(self, **parameters: float) -> None:
-        super().__init__()
-        self.config: dict[str, Any] = {"_target_": target_of(type(self)), **parameters}
+    @property
+    def config(self) -> dict[str, Any]:
+        """Settings with ``_target_`` that make the activation again."""
+        return {"_target_": target_of(type(self)), **{k: getattr(self, k) for k in self.settings}}
 
     def value_and_slope(self, z: Tensor) -> ValueAndSlope:
         """f(z) and f′(z), each of the shape of z."""
@@ -106,11 +106,11 @@ class Softplus(Activation):
         ValueError: β is not positive.
     """
 
-    from_value = True
+    from_value, settings = True, ("beta",)
 
     def __init__(self, beta: float = 1.0) -> None:
-        super().__init__(beta=_positive("beta", beta))
-        self.beta = beta
+        super().__init__()
+        self.beta = _positive("beta", beta)
 
     def value_and_slope(self, z: Tensor) -> ValueAndSlope:
         return F.softplus(z, beta=self.beta), torch.sigmoid(self.beta * z)
@@ -130,12 +130,12 @@ class LeakyReLU(Activation):
         ValueError: the slope is negative.
     """
 
-    from_value = True
+    from_value, settings = True, ("negative_slope",)
 
     def __init__(self, negative_slope: float = 0.01) -> None:
         if not negative_slope >= 0:
             raise ValueError(f"activation.negative_slope={negative_slope} is negative")
-        super().__init__(negative_slope=negative_slope)
+        super().__init__()
         self.negative_slope = negative_slope
 
     def value_and_slope(self, z: Tensor) -> ValueAndSlope:
@@ -207,11 +207,11 @@ class ELU(Activation):
         ValueError: α is not positive.
     """
 
-    from_value = True
+    from_value, settings = True, ("alpha",)
 
     def __init__(self, alpha: float = 1.0) -> None:
-        super().__init__(alpha=_positive("alpha", alpha))
-        self.alpha = alpha
+        super().__init__()
+        self.alpha = _positive("alpha", alpha)
 
     def value_and_slope(self, z: Tensor) -> ValueAndSlope:
         below = self.alpha * torch.exp(z.clamp(max=0))
@@ -231,9 +231,11 @@ class Sine(Activation):
         ValueError: ω is not positive.
     """
 
+    settings = ("omega",)
+
     def __init__(self, omega: float = 30.0) -> None:
-        super().__init__(omega=_positive("omega", omega))
-        self.omega = omega
+        super().__init__()
+        self.omega = _positive("omega", omega)
 
     def value_and_slope(self, z: Tensor) -> ValueAndSlope:
         return torch.sin(self.omega * z), self.omega * torch.cos(self.omega * z)
@@ -256,9 +258,11 @@ class Elementwise(Activation):
     ) -> None:
         super().__init__()
         self.function = function
-        known = config or getattr(function, "config", None)
-        kind = type(function) if isinstance(function, nn.Module) else function
-        self.config = dict(known) if known else {"_target_": target_of(kind)}
+        self._config = config or getattr(function, "config", None) or _settings_of(function)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return dict(self._config)
 
     def forward(self, z: Tensor) -> Tensor:
         return self.function(z)
@@ -274,6 +278,16 @@ class Elementwise(Activation):
         # in reverse mode: PyTorch has no second forward derivative of some, Mish among them
         bend: Tensor = torch.func.grad(slope)(z)
         return bend
+
+
+def _settings_of(function: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Settings that make a module of its default parameters, or a function, again."""
+    if isinstance(function, nn.Module):
+        return {"_target_": target_of(type(function))}
+    name = getattr(function, "__name__", type(function).__name__)
+    # functions of torch that are written in C do not know their module
+    target = f"torch.{name}" if getattr(torch, name, None) is function else target_of(function)
+    return {"_target_": target, "_partial_": True}
 
 
 def as_activation(

@@ -373,4 +373,3 @@ class SplineGrid(nn.Module):
             seen = table.index_select(0, row.flatten()).view(*row.shape, self.features)
             parts.append((weight[:, :, None] * seen).sum(dim=0))
         return torch.cat(parts, dim=-1)
-

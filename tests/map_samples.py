@@ -50,3 +50,24 @@ def randomised(map_: torch.nn.Module, scale: float = 0.3) -> torch.nn.Module:
         for parameter in map_.parameters():
             parameter.copy_(scale * torch.randn_like(parameter))
     return map_
+
+
+class Net(torch.nn.Module):
+    """A network of a user's, that knows nothing of nsm."""
+
+    def __init__(self, out_dim, width=4, activation=None):
+        super().__init__()
+        self.first, self.last = torch.nn.Linear(2, width), torch.nn.Linear(width, out_dim)
+        self.activation = activation
+
+    def forward(self, x):
+        return self.last(self.activation(self.first(x)))
+
+
+class Polar(torch.nn.Module):
+    """An encoding of a user's."""
+
+    out_dim = 3
+
+    def forward(self, x):
+        return torch.cat([x, (x * x).sum(dim=-1, keepdim=True)], dim=-1)
