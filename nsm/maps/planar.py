@@ -22,6 +22,7 @@ class IdentityInitializedMap(nn.Module):
         ValueError: the network has no linear layer, or is not zero all the same.
     """
 
+    network: Any
     network_out_dim: ClassVar[int] = 2
 
     def __init__(self, network: nn.Module) -> None:
