@@ -79,7 +79,7 @@ def symmetric_dirichlet(m: Invariants, epsilon: float = 0.01) -> Tensor:
     Raises:
         ValueError: ``epsilon`` is negative.
     """
-    if epsilon < 0:
+    if not epsilon >= 0:
         raise ValueError(f"epsilon of the symmetric Dirichlet energy is negative: {epsilon}")
     shifted = m.shifted(max(epsilon, COLLAPSE))
     return m.trace + shifted.trace / shifted.determinant

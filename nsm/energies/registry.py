@@ -6,12 +6,13 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from difflib import get_close_matches
+from typing import ClassVar, NamedTuple
 
+import torch
 from torch import Tensor
 
 from nsm.energies import distortion
-from nsm.energies.naming import look_up
 
 
 class At(NamedTuple):
@@ -31,7 +32,21 @@ Energy = Callable[..., Tensor]
 
 
 @dataclass(frozen=True)
-class SymmetricDirichlet:
+class _OfMetrics:
+    """An energy of this room as an object; its fields are the parameters of ``formula``."""
+
+    formula: ClassVar[Callable[..., Tensor]]
+
+    def __post_init__(self) -> None:
+        isometry = torch.eye(2)
+        self(isometry, isometry)  # ValueError for a parameter out of range
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return type(self).formula(source, target, **vars(self))
+
+
+@dataclass(frozen=True)
+class SymmetricDirichlet(_OfMetrics):
     """METHOD, Eq. 2 (see :func:`nsm.energies.symmetric_dirichlet`).
 
     Args:
@@ -41,74 +56,61 @@ class SymmetricDirichlet:
         ValueError: ε is negative.
     """
 
+    formula = staticmethod(distortion.symmetric_dirichlet)
     epsilon: float = 0.01
 
-    def __post_init__(self) -> None:
-        if not self.epsilon >= 0:
-            raise ValueError(f"energy.epsilon must not be negative: {self.epsilon}")
-
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.symmetric_dirichlet(source, target, self.epsilon)
-
 
 @dataclass(frozen=True)
-class Conformal:
+class Conformal(_OfMetrics):
     """METHOD, Eq. 3 (see :func:`nsm.energies.conformal`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.conformal(source, target)
+    formula = staticmethod(distortion.conformal)
 
 
 @dataclass(frozen=True)
-class SingularValueRatio:
+class SingularValueRatio(_OfMetrics):
     """σ₁/σ₂ (see :func:`nsm.energies.singular_value_ratio`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.singular_value_ratio(source, target)
+    formula = staticmethod(distortion.singular_value_ratio)
 
 
 @dataclass(frozen=True)
-class ARAP:
+class ARAP(_OfMetrics):
     """As rigid as possible (see :func:`nsm.energies.arap`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.arap(source, target)
+    formula = staticmethod(distortion.arap)
 
 
 @dataclass(frozen=True)
-class SymmetricARAP:
+class SymmetricARAP(_OfMetrics):
     """As rigid as possible, both ways (see :func:`nsm.energies.symmetric_arap`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.symmetric_arap(source, target)
+    formula = staticmethod(distortion.symmetric_arap)
 
 
 @dataclass(frozen=True)
-class MIPS:
+class MIPS(_OfMetrics):
     """σ₁/σ₂ + σ₂/σ₁ (see :func:`nsm.energies.mips`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.mips(source, target)
+    formula = staticmethod(distortion.mips)
 
 
 @dataclass(frozen=True)
-class Area:
+class Area(_OfMetrics):
     """Change of area (see :func:`nsm.energies.area`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.area(source, target)
+    formula = staticmethod(distortion.area)
 
 
 @dataclass(frozen=True)
-class Dirichlet:
+class Dirichlet(_OfMetrics):
     """(σ₁² + σ₂²)/2 (see :func:`nsm.energies.dirichlet`)."""
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.dirichlet(source, target)
+    formula = staticmethod(distortion.dirichlet)
 
 
 @dataclass(frozen=True)
-class EquiarealConformal:
+class EquiarealConformal(_OfMetrics):
     """Angles and areas in one (see :func:`nsm.energies.equiareal_conformal`).
 
     Args:
@@ -118,27 +120,15 @@ class EquiarealConformal:
         ValueError: ``blend`` is out of range.
     """
 
+    formula = staticmethod(distortion.equiareal_conformal)
     blend: float = 0.5
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.blend <= 1:
-            raise ValueError(f"energy.blend is not in [0, 1]: {self.blend}")
 
-    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
-        return distortion.equiareal_conformal(source, target, self.blend)
-
-
-ENERGIES: dict[str, Callable[..., Energy]] = {
-    "symmetric_dirichlet": SymmetricDirichlet,
-    "conformal": Conformal,
-    "singular_value_ratio": SingularValueRatio,
-    "arap": ARAP,
-    "symmetric_arap": SymmetricARAP,
-    "mips": MIPS,
-    "area": Area,
-    "dirichlet": Dirichlet,
-    "equiareal_conformal": EquiarealConformal,
-}
+_KINDS = (
+    *(SymmetricDirichlet, Conformal, SingularValueRatio, ARAP, SymmetricARAP, MIPS, Area),
+    *(Dirichlet, EquiarealConformal),
+)
+ENERGIES: dict[str, Callable[..., Energy]] = {kind.formula.__name__: kind for kind in _KINDS}
 
 
 def _with_at(energy: Energy) -> Callable[[Tensor, Tensor, At | None], Tensor]:
@@ -195,12 +185,17 @@ class Blend:
             if name not in weights:
                 raise ValueError(f"energy.terms: {name!r} has no weight in energy.weights")
         for name, weight in weights.items():
+            if name not in terms and name not in ENERGIES:
+                nearest = get_close_matches(str(name), ENERGIES, n=1, cutoff=0.0)[0]
+                raise ValueError(
+                    f"energy {name!r} is not known: did you mean {nearest!r}? known are "
+                    f"{', '.join(ENERGIES)}, and the names in energy.terms"
+                )
             if not (math.isfinite(weight) and weight >= 0):
                 raise ValueError(f"weight of energy {name!r} is negative or not finite: {weight}")
         self.weights = {name: float(weight) for name, weight in weights.items()}
         self._energies = {
-            name: _with_at(terms[name] if name in terms else look_up(ENERGIES, name, "energy")())
-            for name in weights
+            name: _with_at(terms[name] if name in terms else ENERGIES[name]()) for name in weights
         }
 
     def parts(self, source: Tensor, target: Tensor, at: At | None = None) -> dict[str, Tensor]:

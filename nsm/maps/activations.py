@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from nsm.errors import NsmError
 from nsm.instantiation import target_of
 
 ValueAndSlope = tuple[Tensor, Tensor]
@@ -249,8 +250,8 @@ class Elementwise(Activation):
 
     Args:
         function: z (...) to f(z) (...), entry by entry.
-        config: settings with ``_target_`` from which the function is made again; by default those
-            of the module or function itself.
+        config: settings with ``_target_`` that make the function again; by default, its own
+            ``config``, or its class or name.
     """
 
     def __init__(
@@ -268,8 +269,8 @@ class Elementwise(Activation):
         return self.function(z)
 
     def value_and_slope(self, z: Tensor) -> ValueAndSlope:
-        value, slope = torch.func.jvp(self.function, (z,), (torch.ones_like(z),))
-        return value, slope
+        both = torch.func.jvp(self.function, (z,), (torch.ones_like(z),))
+        return both[0], both[1]
 
     def curvature(self, z: Tensor) -> Tensor:
         def slope(y: Tensor) -> Tensor:
@@ -296,15 +297,17 @@ def as_activation(
     """An activation of ours as it is; any other module or function as :class:`Elementwise`.
 
     Raises:
-        ValueError: what is given cannot be called, or does not keep the shape of its argument.
+        NsmError: what is given cannot be called, or does not keep the shape of its argument.
     """
     if isinstance(given, Activation):
         return given
     if not callable(given):
-        raise ValueError(f"activation: a {type(given).__name__} is no function of a tensor")
+        message = f"activation: a {type(given).__name__} is no function of a tensor"
+        raise NsmError(message, kind="wrong_type", key="activation")
     activation = Elementwise(given, config)
     with torch.no_grad():
         value = activation(torch.linspace(-1.0, 1.0, 6).view(2, 3))
     if not isinstance(value, Tensor) or value.shape != (2, 3):
-        raise ValueError("activation: it must give one value for each entry of its argument")
+        message = "activation: it must give one value for each entry of its argument"
+        raise NsmError(message, kind="wrong_shape", key="activation")
     return activation

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from nsm.errors import NsmError
 from nsm.instantiation import target_of
 
 
@@ -55,13 +56,14 @@ def as_encoding(given: Any, config: dict[str, Any] | None = None) -> Encoding:
 
     Args:
         given: a module from points (N, 2) to features (N, ``out_dim``).
-        config: settings with ``_target_`` from which it is made again; by default its own.
+        config: settings with ``_target_`` that make it again; by default, its class.
 
     Raises:
-        ValueError: it has no ``out_dim``.
+        NsmError: it has no ``out_dim``.
     """
     if not isinstance(getattr(given, "out_dim", None), int):
-        raise ValueError("encoding: it needs out_dim, its number of features")
+        message = "encoding: it needs an attribute out_dim, its number of features"
+        raise NsmError(message, kind="wrong_type", key="encoding")
     if not hasattr(given, "config"):
         given.config = dict(config or {"_target_": target_of(type(given))})
     encoding: Encoding = given

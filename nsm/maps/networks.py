@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from nsm.errors import NsmError
 from nsm.instantiation import check_trusted, made, made_with
 from nsm.maps.activations import Activation, Softplus, as_activation
 from nsm.maps.encodings import (
@@ -252,16 +250,16 @@ def build_network(
         A module with ``value_and_jacobian`` and ``config``.
 
     Raises:
-        NsmError: a target cannot be imported or refuses its settings.
+        NsmError: a target cannot be imported or refuses its settings, or what it makes does not
+            serve as that part.
     """
     settings = {"_target_": "nsm.maps.NeuralMap", **(map or {})}
     parts: dict[str, Any] = {}
-    with _refused("encoding", encoding):
-        if encoding is not None:
-            parts["encoding"] = as_encoding(made(encoding), dict(encoding))
-    with _refused("activation", activation):
-        if activation is not None:
-            parts["activation"] = as_activation(made(activation), dict(activation))
+    # in this order: the random numbers of a seed go to the encoding first
+    if encoding is not None:
+        parts["encoding"] = as_encoding(made(encoding), dict(encoding))
+    if activation is not None:
+        parts["activation"] = as_activation(made(activation), dict(activation))
     network: nn.Module = made_with(settings, out_dim=out_dim, **parts)
     if not hasattr(network, "value_and_jacobian"):
         network = ForeignMap(network)
@@ -290,13 +288,3 @@ def build_stored(config: Mapping[str, Any], trust: Iterable[str] = ()) -> nn.Mod
     parts = dict(config)
     named = {k: parts.pop(k, None) for k in ("activation", "encoding")}
     return build_network(parts, **named, out_dim=parts.pop("out_dim", 3))
-
-
-@contextmanager
-def _refused(group: str, settings: Mapping[str, Any] | None) -> Iterator[None]:
-    """ValueErrors of a part as errors of its settings."""
-    try:
-        yield
-    except ValueError as error:
-        target = (settings or {}).get("_target_")
-        raise NsmError(f"{target}: {error}", kind="not_instantiable", key=group) from error

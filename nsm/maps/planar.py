@@ -7,6 +7,8 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from nsm.errors import NsmError
+
 
 class IdentityInitializedMap(nn.Module):
     """A map around a network whose output is zero at the start.
@@ -19,7 +21,7 @@ class IdentityInitializedMap(nn.Module):
         config: settings with ``_target_`` from which :func:`nsm.maps.build_stored` makes it again.
 
     Raises:
-        ValueError: the network has no linear layer, or is not zero all the same.
+        NsmError: the network has no linear layer at its end, or another number of outputs.
     """
 
     network: Any
@@ -30,11 +32,19 @@ class IdentityInitializedMap(nn.Module):
         self.network = network
         linear = [m for m in network.modules() if isinstance(m, nn.Linear)]
         last = getattr(network, "output", linear[-1] if linear else None)
-        if not isinstance(last, nn.Linear):
-            raise ValueError("map: its network needs a linear layer at its end")
-        nn.init.zeros_(last.weight)
-        if last.bias is not None:
-            nn.init.zeros_(last.bias)
+        if isinstance(last, nn.Linear):
+            nn.init.zeros_(last.weight)
+            if last.bias is not None:
+                nn.init.zeros_(last.bias)
+        with torch.no_grad():
+            start = network(next(network.parameters(), torch.zeros(())).new_full((1, 2), 0.25))
+        if start.shape != (1, self.network_out_dim) or start.count_nonzero():
+            raise NsmError(
+                f"map: its network needs {self.network_out_dim} outputs, and a linear layer at its "
+                "end to start at zero",
+                kind="unsuitable_network",
+                key="map",
+            )
 
     @classmethod
     def around(cls, network: nn.Module) -> Self:

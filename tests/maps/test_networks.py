@@ -111,9 +111,6 @@ def test_siren_keeps_its_spread_with_depth():
         lambda: NeuralMap(initialization="zero"),
         lambda: NeuralMap(linear_skip="curved"),
         lambda: NeuralMap(width=0),
-        lambda: NeuralMap(encoding=torch.nn.Identity()),
-        lambda: NeuralMap(activation=3.0),
-        lambda: NeuralMap(activation=lambda z: z.sum()),
         lambda: Softplus(beta=0.0),
         lambda: Softplus(beta=-1.0),
         lambda: Softplus(beta=float("nan")),
@@ -132,12 +129,26 @@ def test_parameters_out_of_range_are_refused(make):
 
 
 @pytest.mark.parametrize(
+    ("parts", "kind", "key"),
+    [
+        ({"encoding": torch.nn.Identity()}, "wrong_type", "encoding"),
+        ({"activation": 3.0}, "wrong_type", "activation"),
+        ({"activation": lambda z: z.sum()}, "wrong_shape", "activation"),
+    ],
+)
+def test_what_is_no_part_of_a_network_is_refused(parts, kind, key):
+    with pytest.raises(NsmError) as error:
+        NeuralMap(**parts)
+    assert (error.value.kind, error.value.key) == (kind, key)
+
+
+@pytest.mark.parametrize(
     ("settings", "kind", "key"),
     [
         ({"activation": activation("Softplus", beta=0)}, "not_instantiable", None),
         ({"activation": activation("ReLU", beta=2)}, "not_instantiable", None),
         ({"activation": activation("Swishh")}, "not_instantiable", None),
-        ({"encoding": {"_target_": "torch.nn.Tanh"}}, "not_instantiable", "encoding"),
+        ({"encoding": {"_target_": "torch.nn.Tanh"}}, "wrong_type", "encoding"),
         ({"map": {"block": "dense"}}, "not_instantiable", "nsm.maps.NeuralMap"),
     ],
 )

@@ -5,6 +5,7 @@ import torch
 from map_samples import PLANAR, activation, planar
 from torch.func import jacfwd, jacrev, vmap
 
+from nsm.errors import NsmError
 from nsm.maps import build_stored
 
 SMALL = {"width": 8, "depth": 1, "act": activation("Tanh")}
@@ -82,5 +83,13 @@ def test_a_network_of_the_user_is_zero_at_the_start(onto):
 
 
 def test_a_network_without_a_last_layer_is_refused():
-    with pytest.raises(ValueError):
-        PLANAR[None](torch.nn.Tanh())
+    outputs = torch.nn.Linear(2, 2)
+    for network in (torch.nn.Tanh(), torch.nn.Linear(2, 5), torch.nn.Sequential(outputs, Shift())):
+        with pytest.raises(NsmError) as error:
+            PLANAR[None](network)
+        assert error.value.kind == "unsuitable_network"
+
+
+class Shift(torch.nn.Module):
+    def forward(self, x):
+        return x + 1
