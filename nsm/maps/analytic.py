@@ -1,15 +1,16 @@
-"""Surfaces in closed form, with closed-form Jacobians: targets that need no overfit network.
+"""Surfaces in closed form: targets that need no overfit network.
 
-Each shape is given by its proportions, over the unit disc (or the square around it), and scaled
-as a whole so that the part over the unit disc has area ``area``, π by default, as every surface
-of the method has; ``area=None`` keeps the size that the formula gives.
+Each shape is a function of (u, v), over the unit disc (or the square around it), that PyTorch
+differentiates in forward mode. It is scaled as a whole so that the part over the unit disc has
+area ``area``, π by default, as every surface of the method has; ``area=None`` keeps the size that
+the formula gives.
 """
 
 from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from functools import partial
 from typing import Any
@@ -18,10 +19,11 @@ import torch
 from torch import Tensor, nn
 
 from nsm.errors import NsmError
-from nsm.maps.expressions import Triple, parse_expression, value_and_slopes
+from nsm.instantiation import instantiate_stored, target_of
+from nsm.maps.encodings import Identity, pushed_forward
+from nsm.maps.expressions import evaluate, parse_expression
 
-# coordinates, and their derivatives by u and by v: each a triple of (N,)
-Evaluation = tuple[Triple, Triple, Triple]
+Triple = tuple[Tensor, Tensor, Tensor]  # coordinates, each (N,)
 
 
 def _disc_nodes(rings: int = 128, spokes: int = 128) -> tuple[Tensor, Tensor]:
@@ -35,11 +37,15 @@ def _disc_nodes(rings: int = 128, spokes: int = 128) -> tuple[Tensor, Tensor]:
 class AnalyticSurface(nn.Module):
     """A surface Ω → R³ in closed form.
 
-    Subclasses check their parameters, hand them to this constructor, and answer ``evaluate``.
+    Subclasses check their parameters, hand them to this constructor, which keeps them as
+    attributes, and answer ``point``.
 
     Args:
         area: area of the surface over the unit disc, or None for no scaling.
-        **parameters: what, with the area, makes up ``config``.
+        **parameters: of the shape.
+
+    Attributes:
+        config: settings from which :func:`build_analytic` makes the surface again.
 
     Raises:
         NsmError: the area is not positive, or the surface has no finite positive area, or its
@@ -50,13 +56,19 @@ class AnalyticSurface(nn.Module):
 
     def __init__(self, area: float | None, **parameters: Any) -> None:
         super().__init__()
-        self.config: dict[str, Any] = {"name": self.name, **parameters, "area": area}
+        self.config = {"_target_": target_of(type(self)), **parameters, "area": area}
+        for key, value in parameters.items():
+            setattr(self, key, value)
         self.scale = 1.0
-        if area is not None and not 0 < area < math.inf:
-            raise NsmError(f"{self.name}: area must be positive, or none, not {area}")
+        self._require(area is None or 0 < area < math.inf, "area", "be positive, or none", area)
         natural = self._natural_area()
         if area is not None:
             self.scale = math.sqrt(area / natural)
+
+    def _require(self, holds: bool, parameter: str, demand: str, given: object) -> None:
+        if not holds:
+            message = f"{self.name}: {parameter} must {demand}, not {given}"
+            raise NsmError(message, kind="out_of_range", key=parameter)
 
     def _natural_area(self) -> float:
         inner, rim = _disc_nodes()
@@ -66,33 +78,28 @@ class AnalyticSurface(nn.Module):
             finite = torch.cat([value, jacobian.flatten(1)], dim=1).isfinite().all(dim=1)
             if not finite.all():
                 u, v = x[~finite][0].tolist()
-                raise NsmError(f"{self.name}: not finite, or not smooth, at u={u:.3g}, v={v:.3g}")
+                message = f"{self.name}: not finite, or not smooth, at u={u:.3g}, v={v:.3g}"
+                raise NsmError(message, kind="not_finite", key=self.name)
         _, jacobian = self.value_and_jacobian(inner)
         columns = jacobian.unbind(dim=-1)
         area = math.pi * float(torch.linalg.cross(*columns, dim=-1).norm(dim=-1).mean())
         if not 0 < area < math.inf:
-            raise NsmError(f"{self.name}: its area over the unit disc is {area}")
+            message = f"{self.name}: its area over the unit disc is {area}"
+            raise NsmError(message, kind="out_of_range", key=self.name)
         return area
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        """Unscaled coordinates and their derivatives by u and by v, at u (N,) and v (N,)."""
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        """Unscaled coordinates, each (N,), at u (N,) and v (N,)."""
         raise NotImplementedError
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) points of Ω to (N, 3)."""
-        return self.value_and_jacobian(x)[0]
+        return self.scale * torch.stack(self.point(x[..., 0], x[..., 1]), dim=-1)
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, 3) and Jacobians (N, 3, 2), differentiable in x."""
-        value, by_u, by_v = (
-            torch.stack(parts, dim=-1) for parts in self.evaluate(x[..., 0], x[..., 1])
-        )
-        return self.scale * value, self.scale * torch.stack([by_u, by_v], dim=-1)
-
-
-def _require(holds: bool, surface: str, demand: str, given: object) -> None:
-    if not holds:
-        raise NsmError(f"{surface}: {demand}, not {given}")
+        stack = pushed_forward(self, Identity().value_and_jacobian_stack(x))
+        return stack[0], stack[1:].permute(1, 2, 0)
 
 
 class Plane(AnalyticSurface):
@@ -103,9 +110,8 @@ class Plane(AnalyticSurface):
     def __init__(self, area: float | None = math.pi) -> None:
         super().__init__(area)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        one, zero = torch.ones_like(u), torch.zeros_like(u)
-        return (u, v, zero), (one, zero, zero), (zero, one, zero)
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        return u, v, torch.zeros_like(u)
 
 
 class SphereCap(AnalyticSurface):
@@ -119,20 +125,16 @@ class SphereCap(AnalyticSurface):
     """
 
     name = "sphere_cap"
+    angle: float
 
     def __init__(self, angle: float = math.pi / 3, area: float | None = math.pi) -> None:
-        _require(0 < angle < math.pi, self.name, "angle must lie between 0 and pi", angle)
-        self.half_tangent = math.tan(angle / 2)
+        self._require(0 < angle < math.pi, "angle", "lie between 0 and pi", angle)
         super().__init__(area, angle=angle)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        k = self.half_tangent
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        k = math.tan(self.angle / 2)
         w = 2 / (1 + k * k * (u * u + v * v))
-        w_u, w_v = -(k * k) * u * w * w, -(k * k) * v * w * w
-        value = (k * u * w, k * v * w, w - 1)
-        by_u = (k * (w + u * w_u), k * v * w_u, w_u)
-        by_v = (k * u * w_v, k * (w + v * w_v), w_v)
-        return value, by_u, by_v
+        return k * u * w, k * v * w, w - 1
 
 
 class Cylinder(AnalyticSurface):
@@ -143,17 +145,15 @@ class Cylinder(AnalyticSurface):
     """
 
     name = "cylinder"
+    radius: float
 
     def __init__(self, radius: float = 0.6, area: float | None = math.pi) -> None:
-        _require(math.pi * radius > 1, self.name, "radius must exceed 1/pi", radius)
-        self.radius = radius
+        self._require(math.pi * radius > 1, "radius", "exceed 1/pi", radius)
         super().__init__(area, radius=radius)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        r, zero = self.radius, torch.zeros_like(u)
-        sine, cosine = (u / r).sin(), (u / r).cos()
-        value = (r * sine, v, r * (cosine - 1))
-        return value, (cosine, zero, -sine), (zero, torch.ones_like(u), zero)
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        r = self.radius
+        return r * (u / r).sin(), v, r * ((u / r).cos() - 1)
 
 
 class Cone(AnalyticSurface):
@@ -165,17 +165,15 @@ class Cone(AnalyticSurface):
     """
 
     name = "cone"
+    slope: float
+    tip: float
 
     def __init__(self, slope: float = 1.0, tip: float = 0.05, area: float | None = math.pi) -> None:
-        _require(0 < tip < math.inf, self.name, "tip must be positive", tip)
-        self.slope, self.tip = slope, tip
+        self._require(0 < tip < math.inf, "tip", "be positive", tip)
         super().__init__(area, slope=slope, tip=tip)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        one, zero = torch.ones_like(u), torch.zeros_like(u)
-        r = (u * u + v * v + self.tip**2).sqrt()
-        value = (u, v, -self.slope * r)
-        return value, (one, zero, -self.slope * u / r), (zero, one, -self.slope * v / r)
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        return u, v, -self.slope * (u * u + v * v + self.tip**2).sqrt()
 
 
 class Quadric(AnalyticSurface):
@@ -186,16 +184,14 @@ class Quadric(AnalyticSurface):
     """
 
     sign: float
+    curvature: float
 
     def __init__(self, curvature: float = 0.5, area: float | None = math.pi) -> None:
-        self.curvature = curvature
         super().__init__(area, curvature=curvature)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        one, zero = torch.ones_like(u), torch.zeros_like(u)
+    def point(self, u: Tensor, v: Tensor) -> Triple:
         a, b = self.curvature, self.sign * self.curvature
-        value = (u, v, a * u * u + b * v * v)
-        return value, (one, zero, 2 * a * u), (zero, one, 2 * b * v)
+        return u, v, a * u * u + b * v * v
 
 
 class Paraboloid(Quadric):
@@ -218,6 +214,9 @@ class TorusPatch(AnalyticSurface):
     """
 
     name = "torus_patch"
+    minor: float
+    sweep: float
+    tube: float
 
     def __init__(
         self,
@@ -226,21 +225,15 @@ class TorusPatch(AnalyticSurface):
         tube: float = 2.0,
         area: float | None = math.pi,
     ) -> None:
-        _require(0 < minor < 1, self.name, "minor must lie between 0 and 1", minor)
-        _require(0 < sweep <= math.pi, self.name, "sweep must lie between 0 and pi", sweep)
-        _require(0 < tube <= math.pi, self.name, "tube must lie between 0 and pi", tube)
-        self.minor, self.sweep, self.tube = minor, sweep, tube
+        self._require(0 < minor < 1, "minor", "lie between 0 and 1", minor)
+        self._require(0 < sweep <= math.pi, "sweep", "lie between 0 and pi", sweep)
+        self._require(0 < tube <= math.pi, "tube", "lie between 0 and pi", tube)
         super().__init__(area, minor=minor, sweep=sweep, tube=tube)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
+    def point(self, u: Tensor, v: Tensor) -> Triple:
         r, a, b = self.minor, self.sweep, self.tube
-        sine_u, cosine_u = (a * u).sin(), (a * u).cos()
-        sine_v, cosine_v = (b * v).sin(), (b * v).cos()
-        reach, reach_v = 1 + r * cosine_v, -r * b * sine_v
-        value = (reach * cosine_u, reach * sine_u, r * sine_v)
-        by_u = (-a * reach * sine_u, a * reach * cosine_u, torch.zeros_like(u))
-        by_v = (reach_v * cosine_u, reach_v * sine_u, r * b * cosine_v)
-        return value, by_u, by_v
+        reach = 1 + r * (b * v).cos()
+        return reach * (a * u).cos(), reach * (a * u).sin(), r * (b * v).sin()
 
 
 class MobiusGraph(AnalyticSurface):
@@ -253,6 +246,9 @@ class MobiusGraph(AnalyticSurface):
     """
 
     name = "mobius_graph"
+    width: float
+    sweep: float
+    twist: float
 
     def __init__(
         self,
@@ -261,23 +257,14 @@ class MobiusGraph(AnalyticSurface):
         twist: float = 0.5,
         area: float | None = math.pi,
     ) -> None:
-        _require(0 < width < 1, self.name, "width must lie between 0 and 1", width)
-        _require(0 < sweep <= math.pi, self.name, "sweep must lie between 0 and pi", sweep)
-        self.width, self.sweep, self.twist = width, sweep, twist
+        self._require(0 < width < 1, "width", "lie between 0 and 1", width)
+        self._require(0 < sweep <= math.pi, "sweep", "lie between 0 and pi", sweep)
         super().__init__(area, width=width, sweep=sweep, twist=twist)
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
+    def point(self, u: Tensor, v: Tensor) -> Triple:
         w, a, b = self.width, self.sweep, self.sweep * self.twist
-        sine, cosine = (a * u).sin(), (a * u).cos()
-        tilt_sine, tilt_cosine = (b * u).sin(), (b * u).cos()
-        reach, reach_u, reach_v = 1 + w * v * tilt_cosine, -w * b * v * tilt_sine, w * tilt_cosine
-        value = (reach * cosine, reach * sine, w * v * tilt_sine)
-        by_u = (
-            reach_u * cosine - a * reach * sine,
-            reach_u * sine + a * reach * cosine,
-            w * b * v * tilt_cosine,
-        )
-        return value, by_u, (reach_v * cosine, reach_v * sine, w * tilt_sine)
+        reach = 1 + w * v * (b * u).cos()
+        return reach * (a * u).cos(), reach * (a * u).sin(), w * v * (b * u).sin()
 
 
 class Graph(AnalyticSurface):
@@ -294,24 +281,23 @@ class Graph(AnalyticSurface):
     name = "graph"
 
     def __init__(self, z: str, area: float | None = math.pi) -> None:
-        _require(isinstance(z, (str, int, float)), self.name, "z must be an expression", z)
+        self._require(isinstance(z, (str, int, float)), "z", "be an expression", z)
         self._tree = parse_expression(str(z))
         try:
             super().__init__(area, z=str(z))
         except (ArithmeticError, ValueError):
-            raise NsmError(f"graph {z!r}: a constant is not finite, or too large") from None
+            message = f"graph {z!r}: a constant is not finite, or too large"
+            raise NsmError(message, kind="out_of_range", key="z") from None
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        one, zero = torch.ones_like(u), torch.zeros_like(u)
-        z, z_u, z_v = value_and_slopes(self._tree, u, v)
-        return (u, v, z), (one, zero, z_u), (zero, one, z_v)
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        return u, v, evaluate(self._tree, u, v)
 
 
 class Formula(AnalyticSurface):
-    """(x, y, z) by a function of u and v, differentiated by PyTorch's forward mode.
+    """(x, y, z) by a function of u and v.
 
     Args:
-        name: what the surface is called.
+        name: of the surface.
         function: u (N,), v (N,) and parameters to three coordinates (N,), each point's of its own
             u and v alone; finite and smooth on the closed disc.
         **parameters: of the function.
@@ -330,60 +316,57 @@ class Formula(AnalyticSurface):
         try:
             inspect.signature(function).bind(None, None, **parameters)
         except TypeError as error:
-            raise NsmError(f"{name}: {error}") from None
-        self.name, self._point = name, partial(function, **parameters)
-        super().__init__(area, **parameters)
+            raise NsmError(f"{name}: {error}", kind="unknown_setting", key=name) from None
+        self.name, self._function = name, partial(function, **parameters)
+        super().__init__(area)
+        # the name is registered; the function has no other address
+        self.config = {"name": name, **parameters, "area": area}
 
-    def evaluate(self, u: Tensor, v: Tensor) -> Evaluation:
-        one, zero = torch.ones_like(u), torch.zeros_like(u)
-        along_u = torch.func.jvp(self._on_all, (u, v), (one, zero))
-        along_v = torch.func.jvp(self._on_all, (u, v), (zero, one))
-        return along_u[0], along_u[1], along_v[1]
-
-    def _on_all(self, u: Tensor, v: Tensor) -> Triple:
-        x, y, z = (torch.as_tensor(c, dtype=u.dtype) + 0 * u for c in self._point(u, v))
+    def point(self, u: Tensor, v: Tensor) -> Triple:
+        x, y, z = (torch.as_tensor(c, dtype=u.dtype) + 0 * u for c in self._function(u, v))
         return x, y, z
 
 
-ANALYTIC: dict[str, Callable[..., AnalyticSurface]] = {
-    kind.name: kind
-    for kind in (
-        Plane,
-        SphereCap,
-        Cylinder,
-        Cone,
-        Paraboloid,
-        Saddle,
-        TorusPatch,
-        MobiusGraph,
-        Graph,
-    )
-}
+_KINDS = (Plane, SphereCap, Cylinder, Cone, Paraboloid, Saddle, TorusPatch, MobiusGraph, Graph)
+ANALYTIC: dict[str, Callable[..., AnalyticSurface]] = {kind.name: kind for kind in _KINDS}
 
 
-def build_analytic(config: dict[str, Any]) -> AnalyticSurface:
-    """The surface that a configuration names.
+def build_analytic(config: Mapping[str, Any], trust: Iterable[str] = ()) -> AnalyticSurface:
+    """The surface that settings name.
 
     Args:
-        config: ``{"name": ..., parameters}``, as ``AnalyticSurface.config`` gives it.
+        config: ``{"name": ..., parameters}``, or ``AnalyticSurface.config``, whose ``_target_`` is
+            a class.
+        trust: modules beside nsm that this class may come from.
 
     Raises:
         NsmError: the name or a parameter is not known, is missing, or has no good value.
+        NotTrusted: the class is not nsm's, nor of these modules.
     """
     parameters = dict(config)
-    name = parameters.pop("name", None)
+    target = parameters.pop("_target_", None)
+    name = {target_of(kind): kind.name for kind in _KINDS}.get(target)
+    if target is not None and name is None:
+        surface = instantiate_stored(config, trust=trust)
+        if not isinstance(surface, AnalyticSurface):
+            raise NsmError(f"{target} is no analytic surface", kind="wrong_type", key=target)
+        return surface
+    name = parameters.pop("name", name)
     if name not in ANALYTIC:
         nearest = get_close_matches(str(name), ANALYTIC, n=1, cutoff=0.0)[0]
         raise NsmError(
             f"analytic surface {name!r} is not known: did you mean {nearest!r}? "
-            f"known are {', '.join(ANALYTIC)}"
+            f"known are {', '.join(ANALYTIC)}",
+            kind="unknown_option",
+            key="name",
         )
     kind = ANALYTIC[name]
     try:
         inspect.signature(kind).bind(**parameters)
     except TypeError as error:
-        raise NsmError(f"{name}: {error}") from None
+        raise NsmError(f"{name}: {error}", kind="unknown_setting", key=name) from None
     try:
         return kind(**parameters)
     except (TypeError, ArithmeticError):
-        raise NsmError(f"{name}: a parameter is not a fit number in {parameters}") from None
+        message = f"{name}: a parameter is not a suitable number in {parameters}"
+        raise NsmError(message, kind="wrong_type", key=name) from None

@@ -1,4 +1,4 @@
-"""Expressions in u and v given as text, and their derivatives by dual numbers."""
+"""Expressions in u and v given as text."""
 
 from __future__ import annotations
 
@@ -6,47 +6,29 @@ import ast
 import math
 import operator
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from nsm.errors import NsmError
 
-Triple = tuple[Tensor, Tensor, Tensor]
-# A part of an expression, evaluated: a constant, or value, d/du and d/dv (a dual number).
-Dual = float | Triple
-
 _LARGEST_CONSTANT = 1e30  # beside tensors, so that float32 can hold it
 _LONGEST_EXPRESSION = 500  # characters
 _DEEPEST_EXPRESSION = 200  # levels; evaluation takes a stack frame for each
 _CONSTANTS = {"pi": math.pi}
-_OPERATORS: dict[type[ast.operator], Callable[[float, float], float]] = {
+_OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.Pow: math.pow,
 }
-# name -> (on constants, on tensors, derivative from the argument and the value)
-_FUNCTIONS: dict[
-    str,
-    tuple[
-        Callable[[float], float],
-        Callable[[Tensor], Tensor],
-        Callable[[Tensor, Tensor], Tensor],
-    ],
-] = {
-    "sin": (math.sin, torch.sin, lambda x, y: x.cos()),
-    "cos": (math.cos, torch.cos, lambda x, y: -x.sin()),
-    "tan": (math.tan, torch.tan, lambda x, y: 1 + y * y),
-    "exp": (math.exp, torch.exp, lambda x, y: y),
-    "log": (math.log, torch.log, lambda x, y: 1 / x),
-    "sqrt": (math.sqrt, torch.sqrt, lambda x, y: 0.5 / y),
-    "tanh": (math.tanh, torch.tanh, lambda x, y: 1 - y * y),
-    "sinh": (math.sinh, torch.sinh, lambda x, y: x.cosh()),
-    "cosh": (math.cosh, torch.cosh, lambda x, y: x.sinh()),
-    "abs": (abs, torch.abs, lambda x, y: x.sign()),
+_FUNCTIONS: dict[str, tuple[Callable[[float], float], Callable[[Tensor], Tensor]]] = {
+    name: (getattr(math, name), getattr(torch, name))
+    for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "sinh", "cosh")
 }
+_FUNCTIONS["abs"] = abs, torch.abs
 
 
 def parse_expression(text: str) -> ast.expr:
@@ -60,14 +42,16 @@ def parse_expression(text: str) -> ast.expr:
     """
     shown = repr(text if len(text) <= 60 else text[:57] + "...")
     if len(text) > _LONGEST_EXPRESSION:
-        raise NsmError(f"graph {shown}: longer than {_LONGEST_EXPRESSION} characters")
+        message = f"graph {shown}: longer than {_LONGEST_EXPRESSION} characters"
+        raise NsmError(message, kind="invalid_expression", key="z")
     try:
         tree = ast.parse(text.strip(), mode="eval").body
         _check_node(tree)
     except NsmError as error:
-        raise NsmError(f"graph {shown}: {error}") from None
+        raise NsmError(f"graph {shown}: {error}", kind="invalid_expression", key="z") from None
     except (SyntaxError, ValueError, MemoryError, RecursionError):
-        raise NsmError(f"graph {shown}: not an expression in u and v") from None
+        message = f"graph {shown}: not an expression in u and v"
+        raise NsmError(message, kind="invalid_expression", key="z") from None
     return tree
 
 
@@ -96,84 +80,47 @@ def _check_node(node: ast.AST, depth: int = 0) -> None:
         _check_node(child, depth + 1)
 
 
-def value_and_slopes(tree: ast.expr, u: Tensor, v: Tensor) -> Triple:
-    """A parsed expression's value, and its derivatives by u and by v, at u (N,) and v (N,).
+def evaluate(tree: ast.expr, u: Tensor, v: Tensor) -> Tensor:
+    """A parsed expression at u (N,) and v (N,).
 
     Raises:
         ArithmeticError, ValueError: a constant part is not finite, or is too large.
     """
-    return _lift(_evaluate(tree, u, v), u)
+    z = _evaluate(tree, u, v)
+    return torch.full_like(u, _constant(z)) if isinstance(z, float) else z
 
 
-def _evaluate(node: ast.expr, u: Tensor, v: Tensor) -> Dual:
-    """The dual number of a checked tree; parts without u and v stay plain floats."""
+def _evaluate(node: ast.expr, u: Tensor, v: Tensor) -> float | Tensor:
+    """The value of a checked tree; parts without u and v stay plain floats."""
     if isinstance(node, ast.Constant):
         return float(node.value)  # type: ignore[arg-type]
     if isinstance(node, ast.Name):
-        if node.id in _CONSTANTS:
-            return _CONSTANTS[node.id]
-        one, zero = torch.ones_like(u), torch.zeros_like(u)
-        return (u, one, zero) if node.id == "u" else (v, zero, one)
+        return _CONSTANTS[node.id] if node.id in _CONSTANTS else {"u": u, "v": v}[node.id]
     if isinstance(node, ast.UnaryOp):
         operand = _evaluate(node.operand, u, v)
-        return operand if isinstance(node.op, ast.UAdd) else _combine(ast.Mult, -1.0, operand)
+        return operand if isinstance(node.op, ast.UAdd) else -operand
     if isinstance(node, ast.BinOp):
-        return _combine(type(node.op), _evaluate(node.left, u, v), _evaluate(node.right, u, v))
+        operate, both = _OPERATORS[type(node.op)], (node.left, node.right)
+        left, right = (_evaluate(part, u, v) for part in both)
+        if isinstance(left, float) and isinstance(right, float):
+            return operate(left, right)
+        left, right = (_constant(x) if isinstance(x, float) else x for x in (left, right))
+        if operate is not math.pow:
+            return operate(left, right)
+        if isinstance(right, float):
+            return left**right
+        # a^b = exp(b log a): the base must be positive, as for real powers it must
+        return torch.exp(right * torch.log(torch.as_tensor(left, dtype=u.dtype, device=u.device)))
     assert isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-    return _apply(node.func.id, _evaluate(node.args[0], u, v))
-
-
-def _apply(function: str, argument: Dual) -> Dual:
-    on_constants, on_tensors, slope_of = _FUNCTIONS[function]
+    argument = _evaluate(node.args[0], u, v)
+    on_constants, on_tensors = _FUNCTIONS[node.func.id]
     if isinstance(argument, float):
         return float(on_constants(argument))
-    x, x_u, x_v = argument
-    y = on_tensors(x)
-    slope = slope_of(x, y)
-    return y, slope * x_u, slope * x_v
+    return on_tensors(argument)
 
 
-def _combine(kind: type[ast.operator], left: Dual, right: Dual) -> Dual:
-    if isinstance(left, float) and isinstance(right, float):
-        return _OPERATORS[kind](left, right)
-    if kind is ast.Pow:
-        return _power(left, right)
-    like = next(x[0] for x in (left, right) if not isinstance(x, float))
-    a, a_u, a_v = _lift(left, like)
-    b, b_u, b_v = _lift(right, like)
-    if kind is ast.Add:
-        return a + b, a_u + b_u, a_v + b_v
-    if kind is ast.Sub:
-        return a - b, a_u - b_u, a_v - b_v
-    if kind is ast.Mult:
-        return a * b, a_u * b + a * b_u, a_v * b + a * b_v
-    quotient = a / b
-    return quotient, (a_u - quotient * b_u) / b, (a_v - quotient * b_v) / b
-
-
-def _power(base: Dual, exponent: Dual) -> Dual:
-    if isinstance(exponent, float):
-        assert not isinstance(base, float)
-        if exponent == 0:
-            return 1.0
-        _check_constant(exponent)
-        x, x_u, x_v = base
-        slope = exponent * x ** (exponent - 1)
-        return x**exponent, slope * x_u, slope * x_v
-    # a^b = exp(b log a): the base must be positive, as for real powers it must
-    y, y_u, y_v = _lift(base, exponent[0])
-    logarithm = _apply("log", (y, y_u, y_v))
-    return _apply("exp", _combine(ast.Mult, exponent, logarithm))
-
-
-def _check_constant(x: float) -> None:
+def _constant(x: float) -> float:
+    """A constant that stands beside tensors."""
     if not abs(x) <= _LARGEST_CONSTANT:
         raise OverflowError
-
-
-def _lift(x: Dual, like: Tensor) -> Triple:
-    if isinstance(x, float):
-        _check_constant(x)
-        zero = torch.zeros_like(like)
-        return torch.full_like(like, x), zero, zero
     return x
