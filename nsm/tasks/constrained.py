@@ -105,7 +105,8 @@ class ConstrainedMap(Training):
         """Take landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point."""
         named = {"points": points, "targets": targets, "start": start, "seam": seam}
-        for name, tensor in {**named, "rim": bounded(self.domain).boundary_samples()}.items():
+        named["boundary_samples"] = bounded(self.domain).boundary_samples()
+        for name, tensor in named.items():
             self.register_buffer(name, tensor, persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
 
