@@ -64,7 +64,7 @@ def register() -> None:
     Mappings are open: the check knows which keys they may have, and names the nearest.
     """
     node = OmegaConf.create({**defaults(), **{key: {} for key in (*GROUPS, "logger", *_WEIGHTS)}})
-    for key, value in node.items():
+    for value in node.values():
         if isinstance(value, DictConfig):
             OmegaConf.set_struct(value, False)
     node.update(energy=None, constraints=None)

@@ -144,6 +144,7 @@ def remarks(thing: Callable[..., Any]) -> dict[str, str]:
         for parameter in docstring_parser.parse(text or "").params:
             line = " ".join((parameter.description or "").split())
             line = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", line).replace("``", "`")
+            line = re.sub(r" \(default: .*\)$", "", line)  # the value stands beside it
             for name in parameter.arg_name.split(","):
                 found.setdefault(name.strip("* "), line.rstrip("."))
     return found

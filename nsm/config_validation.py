@@ -212,7 +212,7 @@ def _imported(key: str, target: str) -> Any:
 def _mapping(key: str, node: Any) -> dict[str, Any]:
     if not isinstance(node, Mapping):
         raise NsmError(
-            f"setting {key}: {node!r} is no mapping; give {key}.NAME=VALUE, or see nsm --help {key}",
+            f"setting {key}: {node!r} is no mapping; give {key}.NAME=VALUE; see nsm --help {key}",
             kind="wrong_type",
             key=key,
         )
@@ -304,15 +304,10 @@ def _blamed(group: str) -> Iterator[None]:
     try:
         yield
     except NsmError as error:
-        text, kind = str(error), error.kind
-        key = (
-            error.key
-            if error.key and "." in error.key and error.kind != "not_instantiable"
-            else group
-        )
-        raise NsmError(
-            text if text.startswith("setting ") else f"setting {group}: {text}", kind=kind, key=key
-        ) from error
+        text = str(error)
+        text = text if text.startswith("setting ") else f"setting {group}: {text}"
+        key = error.key if error.key and error.key.startswith(f"{group}.") else group
+        raise NsmError(text, kind=error.kind, key=key) from error
     except (ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise NsmError(f"setting {group}: {reason}", kind="not_instantiable", key=group) from error

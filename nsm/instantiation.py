@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import pkgutil
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hydra.errors import InstantiationException
-from hydra.utils import get_object, instantiate
+from hydra.utils import instantiate
 
 from nsm.errors import NotTrusted, NsmError
 
 # rooms whose classes only compute: making one reads and writes no file
 _ROOMS = ("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.extensions")
+_TASKS = tuple(f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map"))
 _TORCH_MODULES = ("torch.nn.modules.activation", "torch.optim", "torch.optim.lr_scheduler")
 _TORCH_NAMES = ("torch.nn.", "torch.optim.")
 _LOGGERS = ("nsm.results.loggers",)
@@ -49,6 +51,30 @@ def made(config: Any, *args: Any, **kwargs: Any) -> Any:
         raise cause from error
 
 
+def made_with(config: Mapping[str, Any], **offered: Any) -> Any:
+    """The object that a user's settings name, from objects of ours as well.
+
+    Unlike the further arguments of :func:`made`, objects are passed on as they are: Hydra would
+    copy some of them.
+
+    Args:
+        config: a mapping with ``_target_``; what it sets itself takes precedence.
+        offered: by name; the target gets those that its signature names.
+
+    Raises:
+        NsmError: as :func:`made`.
+    """
+    target = str(config["_target_"])
+    factory = made({**config, "_partial_": True})
+    names = inspect.signature(factory.func).parameters
+    given = {key: value for key, value in offered.items() if key in names and key not in config}
+    try:
+        return factory(**given)
+    except (ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise NsmError(f"{target}: {reason}", kind="not_instantiable", key=target) from error
+
+
 def is_trusted(target: str, trust: Iterable[str] = ()) -> bool:
     """Whether a stored ``_target_`` may be made: nsm's, torch's by the list, or a trusted module's.
 
@@ -58,8 +84,8 @@ def is_trusted(target: str, trust: Iterable[str] = ()) -> bool:
     if any(target == module or target.startswith(f"{module}.") for module in trust):
         return True
     homes: tuple[str, ...]
-    if target.startswith(tuple(f"{room}." for room in (*_ROOMS, *_LOGGERS))):
-        homes = (*_ROOMS, *_LOGGERS)
+    if target.startswith(tuple(f"{room}." for room in (*_ROOMS, *_TASKS, *_LOGGERS))):
+        homes = (*_ROOMS, *_TASKS, *_LOGGERS)
     elif target.startswith(_TORCH_NAMES):
         homes = _TORCH_MODULES
     else:
@@ -107,7 +133,8 @@ def target_of(kind: Any) -> str:
 def named_object(target: str) -> Any:
     """The class or function of a user's ``_target_``; NsmError if it cannot be imported."""
     try:
-        return get_object(target)
+        return pkgutil.resolve_name(target)
     except Exception as error:
-        reason = " ".join(str(error).split())[:200]
-        raise NsmError(f"{target}: {reason}", kind="not_importable", key=target) from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        message = f"{target} cannot be imported ({reason})"
+        raise NsmError(message, kind="not_importable", key=target) from error

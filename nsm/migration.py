@@ -6,7 +6,6 @@ run is rewritten, so that its folder can still be loaded and resumed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from nsm.errors import NsmError
@@ -32,7 +31,7 @@ RENAMED = {
     "logger.project": "logger.wandb.project",
     "logger.uri": "logger.mlflow.uri",
 }
-# old option to new option; None: the group has no such option any more
+# old option to new option
 OPTIONS: dict[tuple[str, str], tuple[str, str]] = {
     ("hydra/launcher", "together"): ("hydra/launcher", "batched"),
     ("sweep", "lambda_normal"): ("sweep", "normal_weight"),
@@ -93,28 +92,21 @@ _NAMED = ("activation", "encoding", "optimizer", "scheduler", "task")
 def check_override(key: str, value: str) -> None:
     """NsmError, with the new name, for an override whose setting or option has another name now."""
     bare = key.lstrip("+~")
-    for old, new in RENAMED.items():
-        if bare == old or bare.startswith(f"{old}."):
-            raise _renamed(bare, f"{key}={value}", f"{new}{bare[len(old) :]}={value}")
-    for option in value.split(","):
-        if (bare, option) in OPTIONS:
-            group, name = OPTIONS[bare, option]
-            raise _renamed(bare, f"{key}={value}", f"{group}={name}")
     group, _, last = bare.rpartition(".")
+    new = {
+        "logger.kinds": "logger=tensorboard, csv, both, wandb, mlflow or none",
+        "trainer": "trainer.SETTING=VALUE, as it is no group any more",
+    }.get(bare)
     if last == "name" and group in _NAMED:
-        raise _renamed(bare, f"{key}={value}", f"{group}={value}")
-    if bare == "logger.kinds":
-        raise _renamed(
-            bare, f"{key}={value}", "logger=tensorboard, csv, both, wandb, mlflow or none"
-        )
-    if bare == "trainer":
-        raise _renamed(bare, f"{key}={value}", "trainer.SETTING=VALUE; it is no group any more")
-
-
-def _renamed(key: str, given: str, new: str) -> NsmError:
-    return NsmError(
-        f"{given}: it has another name now; give {new}", kind="renamed_setting", key=key
-    )
+        new = f"{group}={value}"
+    for option in value.split(","):
+        new = "=".join(OPTIONS[bare, option]) if (bare, option) in OPTIONS else new
+    for old, name in RENAMED.items():
+        if bare == old or bare.startswith(f"{old}."):
+            new = f"{name}{bare[len(old) :]}={value}"
+    if new:
+        message = f"{key}={value}: it has another name now; give {new}"
+        raise NsmError(message, kind="renamed_setting", key=bare)
 
 
 def migrated(settings: Any) -> dict[str, Any]:
@@ -128,64 +120,45 @@ def migrated(settings: Any) -> dict[str, Any]:
     """
     if "_target_" in _mapping(settings, "task"):
         return dict(settings)
-    old: dict[str, Any] = {key: value for key, value in settings.items()}
+    old = dict(settings)
     for key in ("domain", "map", "data", "energy", "logger", "trainer", *_NAMED):
         if key not in old:
             raise ValueError(f"it has no {key}")
     name = str(old["task"].get("name"))
     energy, constraints = _mapping(old, "energy"), _mapping(old, "constraints")
-    logger, data = _mapping(old, "logger"), _mapping(old, "data")
+    logger, data, network = (_mapping(old, key) for key in ("logger", "data", "map"))
     shares = {key: data.pop(key) for key in ("vertex_share", "domain_share", "pool") if key in data}
-    weights = {**energy, **constraints}
+    for key in ("initialisation", "readout"):
+        if key in network:
+            network[RENAMED[f"map.{key}"].rpartition(".")[2]] = network.pop(key)
+    weights = {k: v for k, v in {**energy, **constraints}.items() if k.startswith("lambda_")}
+    held = {key: value for key, value in constraints.items() if key not in weights}
+    kinds = {k: {"_target_": _target("logger", k)} for k in logger.get("kinds", ())}
+    for kind, key in (("wandb", "project"), ("mlflow", "project"), ("mlflow", "uri")):
+        if kind in kinds and key in logger:
+            kinds[kind][key] = logger[key]
+    logged = {f"log_{k}": logger[k] for k in ("every", "pictures") if k in logger}
+    blend = {"_target_": "nsm.energies.Blend", "weights": energy.get("weights")}
     kind = "CollectionData" if name == "collection_map" else "SurfaceData"
-    new: dict[str, Any] = {
-        **old,
-        "map": {"_target_": "nsm.maps.NeuralMap", **_mapping(old, "map")},
-        "domain": {"_target_": _target("domain", old["domain"])},
-        "energy": None,
-        "loss_weights": {
-            key.removeprefix("lambda_"): value
-            for key, value in weights.items()
-            if key.startswith("lambda_")
-        },
-        "constraints": {k: v for k, v in constraints.items() if not k.startswith("lambda_")}
-        or None,
-        "sampler": {"_target_": "nsm.data.Sampler", **shares},
-        "data": {"_target_": f"nsm.data.{kind}", **data},
-        "logger": {
-            k: {"_target_": _target("logger", k), **_logger_settings(k, logger)}
-            for k in logger.get("kinds", ())
-        },
-        "trainer": {
-            **_mapping(old, "trainer"),
-            **{f"log_{k}": logger[k] for k in ("every", "pictures") if k in logger},
-        },
-    }
-    if "weights" in energy:
-        new["energy"] = {"_target_": "nsm.energies.Blend", "weights": energy["weights"]}
+    named = {}
     for group in _NAMED:
         rest = _mapping(old, group)
-        given = rest.pop("name", None)
-        new[group] = {"_target_": _target(group, given), **rest}
-    new["task"]["name"] = name
-    new["map"].update(_renamed_keys("map", new["map"]))
-    if "guarantee" in new:
-        new["certification"] = new.pop("guarantee")
-    return {key: value for key, value in new.items() if key not in ("initialisation", "readout")}
-
-
-def _renamed_keys(group: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a group with their new names; the old ones are taken out."""
+        named[group] = {"_target_": _target(group, rest.pop("name", None)), **rest}
+    named["task"]["name"] = name
     return {
-        RENAMED[f"{group}.{key}"].rpartition(".")[2]: settings.pop(key)
-        for key in list(settings)
-        if f"{group}.{key}" in RENAMED
+        **{key: value for key, value in old.items() if key != "guarantee"},
+        **named,
+        "certification": old.get("guarantee", old.get("certification", {})),
+        "map": {"_target_": "nsm.maps.NeuralMap", **network},
+        "domain": {"_target_": _target("domain", old["domain"])},
+        "energy": blend if "weights" in energy else None,
+        "loss_weights": {key.removeprefix("lambda_"): value for key, value in weights.items()},
+        "constraints": held or None,
+        "sampler": {"_target_": "nsm.data.Sampler", **shares},
+        "data": {"_target_": f"nsm.data.{kind}", **data},
+        "logger": kinds,
+        "trainer": {**_mapping(old, "trainer"), **logged},
     }
-
-
-def _logger_settings(kind: str, logger: Mapping[str, Any]) -> dict[str, Any]:
-    takes = {"wandb": ("project",), "mlflow": ("project", "uri")}.get(kind, ())
-    return {key: logger[key] for key in takes if key in logger}
 
 
 def _mapping(settings: Any, key: str) -> dict[str, Any]:
