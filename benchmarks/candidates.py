@@ -19,10 +19,10 @@ from torch.optim import Optimizer
 
 import nsm
 from nsm.data import OverfitData, Samples, SurfaceSampler
+from nsm.domains import Surface
 from nsm.energies.overfit import NORMAL_FLOOR, normal, position
 from nsm.maps import NeuralMap, SplineGrid
 from nsm.maps.encodings import value_and_jacobian_stack
-from nsm.surfaces import Surface
 from nsm.tasks import Overfit
 from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer, scheduled
 

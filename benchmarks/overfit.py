@@ -22,10 +22,10 @@ from rich.console import Console
 from training import MESHES, Clock, OnTheClock, surface_of, train
 
 from nsm.config import compose_config
+from nsm.domains import Surface
 from nsm.pipeline import quiet_lightning
 from nsm.results import atomic_write, overfit_metrics
 from nsm.results.callbacks import GradientWatch
-from nsm.surfaces import Surface
 
 RESULT = Path(__file__).parent / "results" / "overfit.json"
 

@@ -29,6 +29,9 @@ from torch import Tensor, nn
 import nsm
 from nsm.config import compose_config
 from nsm.data import OverfitData, Samples
+from nsm.domains import Surface
+from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.surface import as_it_lies
 from nsm.energies.overfit import normal, position
 from nsm.maps import NeuralMap, build_map, together
 from nsm.pipeline import build_overfit
@@ -36,10 +39,7 @@ from nsm.pipeline.collection_map import build_collection_map
 from nsm.pipeline.pair_map import build_pair_map
 from nsm.pipeline.param import build_param
 from nsm.results import NeuralSurface, atomic_write
-from nsm.surfaces import Surface
-from nsm.surfaces.joint_preparation import matched_landmarks
 from nsm.surfaces.shapes import ring_mesh
-from nsm.surfaces.surface import as_it_lies
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.fold_barrier import FoldBarrier
 

@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import Callback
 
 from nsm.data import OverfitData
+from nsm.domains import Surface
 from nsm.pipeline import build_overfit
-from nsm.surfaces import Surface
 from nsm.tasks import Overfit
 
 MESHES = {

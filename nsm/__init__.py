@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nsm.api import load, map_collection, map_pair, overfit, parameterize
+    from nsm.domains import Surface
     from nsm.errors import NsmError
     from nsm.extensions import (
         register_activation,
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
         register_energy,
     )
     from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
-    from nsm.surfaces import Surface, catalogue_names
+    from nsm.surfaces import catalogue_names
 
 __all__ = [
     "NeuralSurface",
@@ -48,7 +49,7 @@ __all__ = [
 _HOME = {
     "NeuralSurface": "nsm.results",
     "NsmError": "nsm.errors",
-    "Surface": "nsm.surfaces",
+    "Surface": "nsm.domains",
     "SurfaceCollection": "nsm.results",
     "SurfaceMap": "nsm.results",
     "map_collection": "nsm.api",
@@ -71,3 +72,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'nsm' has no attribute {name!r}")
     return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -21,7 +21,9 @@ from nsm.errors import NotTrusted, NsmError
 
 # rooms whose classes only compute: making one reads and writes no file
 _ROOMS = ("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.extensions")
-_TASKS = tuple(f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map"))
+_TASKS = tuple(
+    f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map")
+)
 _TORCH_MODULES = ("torch.nn.modules.activation", "torch.optim", "torch.optim.lr_scheduler")
 _TORCH_NAMES = ("torch.nn.", "torch.optim.")
 _LOGGERS = ("nsm.results.loggers",)

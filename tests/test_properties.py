@@ -22,6 +22,7 @@ from tiny import NETWORK, planar, results, stirred
 import nsm
 from nsm import api, cli, extensions
 from nsm.config import compose_config
+from nsm.domains import Surface
 from nsm.energies import ENERGIES, energy
 from nsm.errors import NsmError
 from nsm.maps import (
@@ -34,7 +35,7 @@ from nsm.maps import (
     build_analytic,
 )
 from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
-from nsm.surfaces import Surface, catalogue_names
+from nsm.surfaces import catalogue_names
 
 NEURAL, FLAT, PAIR, TRIO = results(rings=3)
 VERTICES = len(NEURAL[0].surface.vertices)

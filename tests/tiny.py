@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from nsm.domains import Surface
 from nsm.maps import NeuralMap, Rotated, build_planar
 from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
-from nsm.surfaces import Surface
 from nsm.surfaces.shapes import ring_mesh
 
 NETWORK = {"width": 4, "depth": 1, "block": "plain"}

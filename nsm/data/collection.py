@@ -13,7 +13,7 @@ from nsm.data.sampler import Draws, Sampler
 from nsm.data.sampling import SurfaceSampler
 from nsm.data.shard import Shard
 from nsm.data.surface import HELD_OUT_BATCH, HELD_OUT_SEED, Steps, ready
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 
 
 class CollectionData(pl.LightningDataModule):

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 from nsm.surfaces.topology import edges_of
 
 

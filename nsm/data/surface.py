@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from nsm.data.sampler import Draws, Sampler
 from nsm.data.sampling import Samples, SurfaceSampler
 from nsm.data.shard import Shard
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 
 # Held-out points come from their own stream, whatever the training's seed.
 HELD_OUT_SEED = 7_919

@@ -29,7 +29,7 @@ from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_run, run_job
 from nsm.pipeline.training import Run, plain, trained
 from nsm.results.callbacks import Pictures
 from nsm.results.loggers import WandB
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 from nsm.sweeps import is_complete
 from nsm.tasks import Overfit, OverfitEnsemble
 from nsm.tasks.ensemble import EnsembleSplit

@@ -27,7 +27,7 @@ from nsm.results import (
     transfer_matrix_picture,
 )
 from nsm.results.metrics import evaluate
-from nsm.surfaces.joint_preparation import Matched, matched_landmarks
+from nsm.domains.joint_preparation import Matched, matched_landmarks
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -72,7 +72,7 @@ class CollectionMapTask(Task):
         self.targets, self.rotations = targets, self._rotations(targets)
         self.points = (targets @ self.rotations).mean(dim=0)  # each turned back, R⁻¹ = Rᵀ
         on_boundary = slice(self.matched.on_boundary)
-        self.points[on_boundary] = self.domain.project_to_boundary(self.points[on_boundary])
+        self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
 
     def _rotations(self, targets: torch.Tensor) -> torch.Tensor:
         """(k, 2, 2), from the common domain to those of the surfaces."""

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import domain
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 
 
 def configured_surface(config: DictConfig) -> Surface:

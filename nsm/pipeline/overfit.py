@@ -20,7 +20,7 @@ from nsm.results import (
     overfit_metrics,
     reconstruction_image,
 )
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 

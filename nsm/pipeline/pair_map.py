@@ -32,7 +32,7 @@ from nsm.results import (
     transfer_picture,
 )
 from nsm.results.metrics import evaluate
-from nsm.surfaces.joint_preparation import matched_landmarks
+from nsm.domains.joint_preparation import matched_landmarks
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -87,7 +87,7 @@ class PairMapTask(Task):
             rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
         if self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
-            corners = torch.as_tensor(self.domain.corners, dtype=torch.float32)
+            corners = torch.from_numpy(self.domain.corners).to(p)
             p, q = torch.cat([p, corners]), torch.cat([q, corners @ rotation.T])
         return PairMap(
             **self.map_settings(),

@@ -21,7 +21,7 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
-from nsm.surfaces.baselines import BASELINES
+from nsm.domains.baselines import BASELINES
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 

@@ -26,7 +26,7 @@ from nsm.pipeline.runner import finish, run_prepared
 from nsm.pipeline.training import Run, accelerator_of, plain
 from nsm.results import NeuralSurface, load_surface
 from nsm.run_directories import passing_folder
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit

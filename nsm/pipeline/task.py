@@ -18,7 +18,7 @@ from rich.console import Console
 from nsm.domains import Domain, domain
 from nsm.instantiation import made, made_with
 from nsm.pipeline.training import plain
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 from nsm.tasks.training import Training
 
 

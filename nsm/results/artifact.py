@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nsm.domains import Surface, from_stored, stored
 from nsm.errors import NotRegistered
 from nsm.maps import ANALYTIC, build_analytic, build_map
 from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, check_points
-from nsm.surfaces import Surface
 from nsm.surfaces.cutting import first_copies
 
 FORMAT = "nsm-surface"
@@ -109,7 +109,7 @@ def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
         "map": neural.map.config,
         "surface": {
             "name": surface.name,
-            "domain": surface.domain,
+            "domain": stored(surface.domain),
             "scale": surface.scale,
             "quality": surface.quality,
             "log": list(surface.log),
@@ -141,7 +141,7 @@ def load_surface(folder: str | Path) -> NeuralSurface:
         arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in _ARRAYS}
         surface = Surface(
             name=str(about["name"]),
-            domain=str(about["domain"]),
+            domain=from_stored(about["domain"]),
             scale=float(about["scale"]),
             quality=dict(about["quality"]),
             log=tuple(about["log"]),
@@ -192,5 +192,5 @@ def _check_shapes(surface: Surface) -> None:
             raise ValueError(f"{name} has not {columns} columns")
         if index.size and not 0 <= index.min() <= index.max() < count:
             raise ValueError(f"{name} names a vertex that is not there")
-    if surface.domain not in ("disc", "square") or not 0 < surface.scale < float("inf"):
-        raise ValueError("unknown domain or scale")
+    if not 0 < surface.scale < float("inf"):
+        raise ValueError("unknown scale")

@@ -14,32 +14,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsm.surfaces import Surface
-from nsm.surfaces.flat import boundary_self_intersections
+from nsm.domains import Domain
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped
+from nsm.domains.untangling import untangled
 from nsm.surfaces.topology import boundary_loops
-from nsm.surfaces.untangle import flipped, in_order, order_violations, untangled
 
 
-def certificate(uv: np.ndarray, faces: np.ndarray, *, onto: bool) -> dict[str, Any]:
+def certificate(domain: Domain | None, uv: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
     """The verdict on the piecewise linear map that sends a disc-shaped mesh's vertices to uv.
 
     Args:
+        domain: Ω, which the mesh should cover; without it the boundary is free, and may not cross
+            itself.
         uv: (V, 2) images of the vertices.
         faces: (F, 3), counter-clockwise before the map.
-        onto: the boundary should go to ∂Ω, in order; else it is free, and may not cross itself.
 
     Returns:
-        certified; flipped_triangles; and boundary_order_violations (sides that do not run
-        counter-clockwise around the middle of Ω) or boundary_self_intersections. Certified is
-        true if both counts, which are made with exact signs, are zero.
+        certified; flipped_triangles; and what the domain counts beside them
+        (:meth:`nsm.domains.Domain.certificate`), or boundary_self_intersections. Certified is true
+        if all counts, which are made with exact signs, are zero.
     """
-    loop = boundary_loops(faces)[0]
+    if domain is not None:
+        return domain.certificate(uv, faces)
     turned = int(flipped(uv, faces).sum())
-    if onto:
-        name, wrong = "boundary_order_violations", order_violations(uv[loop])
-    else:
-        name, wrong = "boundary_self_intersections", boundary_self_intersections(uv, loop)
-    return {"certified": turned == 0 and wrong == 0, "flipped_triangles": turned, name: wrong}
+    crossings = boundary_self_intersections(uv, boundary_loops(faces)[0])
+    return {
+        "certified": turned == 0 and crossings == 0,
+        "flipped_triangles": turned,
+        "boundary_self_intersections": crossings,
+    }
 
 
 def combined(certificates: Iterable[dict[str, Any]]) -> dict[str, Any]:
@@ -59,26 +62,24 @@ def verdict(found: dict[str, Any]) -> str:
     return f"{start}: {', '.join(counts)}"
 
 
-def repaired(surface: Surface, image: np.ndarray, *, held: np.ndarray, onto: bool) -> np.ndarray:
-    """The image of a surface's vertices with flips turned back, where that can be done.
+def repaired(
+    domain: Domain | None,
+    rest: np.ndarray,
+    faces: np.ndarray,
+    image: np.ndarray,
+    held: np.ndarray,
+) -> np.ndarray:
+    """The image (V, 2) of a mesh with flips turned back, where that can be done.
 
     Args:
-        surface: whose mesh is mapped.
-        image: (V, 2) where its vertices go.
-        held: (V,) mask of vertices, such as landmarks, that should not move; they are let go where
-            flips remain otherwise.
-        onto: as in :func:`certificate`; the boundary's vertices then move along ∂Ω only, and only
-            if they are out of order.
+        domain: Ω, whose boundary is kept; without it the boundary is free.
+        rest, faces, image, held: as for :meth:`nsm.domains.Domain.repaired`.
     """
-    better, fixed = image.copy(), np.zeros(len(image), dtype=bool)
-    if onto:
-        loop = boundary_loops(surface.faces)[0]
-        fixed[loop] = True
-        if order_violations(better[loop]):
-            better[loop] = in_order(better[loop], surface.uv[loop], surface.domain)
-    for stay in (fixed | held, fixed):
-        better = untangled(surface.uv, surface.faces, better, stay)
-    return better
+    if domain is not None:
+        return domain.repaired(rest, faces, image, held)
+    for stay in (held, np.zeros_like(held)):
+        image = untangled(rest, faces, image, stay)
+    return image
 
 
 @dataclass(frozen=True)

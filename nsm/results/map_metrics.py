@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from nsm.domains.planar_mesh import boundary_self_intersections, signed_areas
 from nsm.energies import area, singular_value_ratio, symmetric_dirichlet
-from nsm.surfaces.flat import boundary_self_intersections, signed_areas
 from nsm.surfaces.topology import boundary_loops, face_areas
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from torch import nn
 
+from nsm.domains import Surface
 from nsm.results.evaluation import evaluate, evaluate_jacobian
 from nsm.results.wrinkles import normal_variation
-from nsm.surfaces import Surface
 from nsm.surfaces.geometry import point_mesh_distance, subdivide
 
 # A triangle whose area φ shrinks below this share of the true one has collapsed.

@@ -11,17 +11,16 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from nsm.domains import Surface, bounded
+from nsm.domains.planar_mesh import signed_areas
 from nsm.energies import (
     arap,
     area,
     conformal,
-    signed_distance,
     singular_value_ratio,
     symmetric_dirichlet,
 )
 from nsm.results.map_metrics import triangle_metric
-from nsm.surfaces import Surface
-from nsm.surfaces.flat import signed_areas
 from nsm.surfaces.location import locate
 from nsm.surfaces.topology import boundary_loops, face_areas
 
@@ -95,7 +94,7 @@ def pair_metrics(
     to_percent = 100 / target.bounding_box_diagonal
     figures = distortion_figures(source.vertices, image, source.faces)
     flipped = signed_areas(image_uv, source.faces) <= 0
-    distance = signed_distance(source.domain, torch.from_numpy(image_uv)).numpy()
+    distance = bounded(source.domain).signed_distance(torch.from_numpy(image_uv)).numpy()
     loop = boundary_loops(source.faces)[0]
     error = np.linalg.norm(lifted(landmark_image) - lifted(landmark_target), axis=1)
     gap = np.linalg.norm(image[source.seam_pairs[:, 0]] - image[source.seam_pairs[:, 1]], axis=1)

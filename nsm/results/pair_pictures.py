@@ -11,13 +11,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from PIL import Image
 
+from nsm.domains import Surface
 from nsm.energies import symmetric_dirichlet
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
 from nsm.results.render import Blend, View
 from nsm.results.surface_map import SurfaceMap
-from nsm.surfaces import Surface
 from nsm.surfaces.location import locate
 
 _STRIP, _GIF = 300, 300

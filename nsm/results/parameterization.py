@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from nsm.domains import Domain
 from nsm.maps import Planar, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired
@@ -60,17 +61,17 @@ class Parameterization:
     @cached_property
     def certificate(self) -> dict[str, Any]:
         """Whether the new coordinates are injective (see :func:`certificate`)."""
-        return certificate(self.uv, self.phi.surface.faces, onto=self._onto)
+        return certificate(self._onto, self.uv, self.phi.surface.faces)
 
     @property
-    def _onto(self) -> bool:
-        return self.map.onto is not None
+    def _onto(self) -> Domain | None:
+        return None if self.map.onto is None else self.phi.surface.domain
 
     def repaired(self) -> Parameterization:
         """The map with its flipped triangles turned back, where that can be done."""
         surface = self.phi.surface
         nothing = np.zeros(len(surface.uv), dtype=bool)
-        better = repaired(surface, self.uv, held=nothing, onto=self._onto)
+        better = repaired(self._onto, surface.uv, surface.faces, self.uv, nothing)
         return replace(self, correction=Correction.between(self.uv, better, self.correction))
 
     def save(self, folder: str | Path) -> None:

@@ -14,11 +14,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import nn
 
+from nsm.domains import Surface
 from nsm.results.files import atomic_write
 from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.render import Blend, View
 from nsm.results.textures import checkerboard_at
-from nsm.surfaces import Surface
 from nsm.surfaces.geometry import subdivide
 
 if TYPE_CHECKING:
@@ -63,8 +63,7 @@ def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurfa
     )
     side = 1.06 * (2 * (np.arange(PANEL) + 0.5) / PANEL - 1)
     grid = np.stack(np.meshgrid(side, side[::-1]), axis=-1)
-    order = 2 if surface.domain == "disc" else np.inf
-    inside = np.linalg.norm(grid, ord=order, axis=-1) <= 1
+    inside = surface.domain.contains(grid)
     flat = checkerboard_at(grid.reshape(-1, 2)).reshape(PANEL, PANEL, 3)
     flat = np.where(inside[:, :, None], flat, 1.0)
     titles = f"{surface.name}: neural surface", f"domain Ω: {surface.domain}"

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.maps import Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
@@ -21,7 +22,6 @@ from nsm.results.files import BROKEN, misfit, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, as_values
-from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 
 FORMAT = "nsm-surface-map"
@@ -87,14 +87,14 @@ class SurfaceMap:
     @cached_property
     def certificate(self) -> dict[str, Any]:
         """Whether the map to the target's domain is injective (see :func:`certificate`)."""
-        return certificate(self.image_uv, self.source.surface.faces, onto=True)
+        return certificate(self.target.surface.domain, self.image_uv, self.source.surface.faces)
 
     def repaired(self) -> SurfaceMap:
         """The map with its flipped triangles turned back, and its boundary put in order, where
         that can be done; landmarks stay if that suffices. Figures are to be measured anew."""
         s = self.source.surface
         held = np.isin(s.source_vertex, s.kept(self.landmarks[:, 0].tolist()))
-        better = repaired(s, self.image_uv, held=held, onto=True)
+        better = repaired(s.domain, s.uv, s.faces, self.image_uv, held)
         result = replace(
             self, correction=Correction.between(self.image_uv, better, self.correction)
         )

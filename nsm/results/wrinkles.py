@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from torch import nn
 
+from nsm.domains import Surface
 from nsm.results.evaluation import evaluate_jacobian
 from nsm.results.render import vertex_normals
-from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 
 # length of the short way, of the diagonal of the mesh's bounding box

@@ -13,7 +13,6 @@ from nsm.tasks.fold_barrier import further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
 
-_BOUNDARY_SAMPLES = 512
 # float32 places a point of the boundary no better than this
 _ON_BOUNDARY = 1e-6
 
@@ -75,9 +74,10 @@ class ConstrainedMap(Training):
     def set_landmarks(self, points: Tensor, targets: Tensor, start: Tensor, seam: Tensor) -> None:
         """Register landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point."""
-        samples = self.domain.boundary_samples(_BOUNDARY_SAMPLES)
         given = {"points": points, "targets": targets, "start": start, "seam": seam}
-        for name, tensor in {**given, "boundary_samples": samples}.items():
+        if not self.exact:
+            given["boundary_samples"] = self.domain.boundary_samples()
+        for name, tensor in given.items():
             self.register_buffer(name, tensor, persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
 
@@ -119,13 +119,14 @@ class ConstrainedMap(Training):
         """Log held-out figures: distortion, folds, and samples outside Ω."""
         assert evaluation.determinant is not None
         determinant, images = evaluation.determinant, evaluation.image
-        folded = 100 * (determinant <= 0).double().mean()
-        stray = 100 * (self.domain.signed_distance(images) > _ON_BOUNDARY).double().mean()
         count = determinant.shape[-1]
         self.held_out.add(distortion)
         self.log("val/distortion", distortion.mean, batch_size=count)
+        folded = 100 * (determinant <= 0).double().mean()
         self.log("val/folded_percent", folded, batch_size=count)
-        self.log("val/outside_percent", stray, batch_size=count)
+        if self.domain.has_boundary:
+            stray = 100 * (self.domain.signed_distance(images) > _ON_BOUNDARY).double().mean()
+            self.log("val/outside_percent", stray, batch_size=count)
 
     def on_validation_epoch_end(self) -> None:
         self.log("val/distortion_median", self.held_out.median())

@@ -20,9 +20,9 @@ from scipy.sparse import csr_matrix, dia_matrix, diags, identity, kron
 from torch import Tensor, nn
 
 from nsm.data import SurfaceSampler
+from nsm.domains import Surface
 from nsm.maps import NeuralMap
 from nsm.maps.encodings import Encoding, SplineGrid, value_and_jacobian_stack
-from nsm.surfaces import Surface
 from nsm.tasks.multigrid import solve
 
 # samples for each grid point or feature

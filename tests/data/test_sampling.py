@@ -11,7 +11,7 @@ from thorough import examples
 from tiny import dome
 
 from nsm.data import OverfitData, SurfaceSampler
-from nsm.surfaces import Surface
+from nsm.domains import Surface
 from nsm.surfaces.location import locate
 
 

@@ -10,11 +10,11 @@ import trimesh
 
 import nsm
 from nsm.config import compose_config
+from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.resolve_inputs import landmark_vertices
 from nsm.results.metrics import evaluate
 from nsm.surfaces.geometry import point_mesh_distance
-from nsm.surfaces.joint_preparation import Mesh
 
 QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
 MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'

@@ -6,9 +6,9 @@ import torch
 from rich.console import Console
 
 from nsm.config import compose_config
+from nsm.domains import Surface
 from nsm.pipeline import build_overfit, common
 from nsm.results.callbacks import Pictures
-from nsm.surfaces import Surface
 
 
 @pytest.mark.parametrize(("words", "expected"), [([], "highest"), (["bf16"], "medium")])

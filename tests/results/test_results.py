@@ -9,6 +9,8 @@ import trimesh
 from PIL import Image
 from torch import nn
 
+from nsm.domains import Surface
+from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
 from nsm.maps import build_map
 from nsm.results import (
@@ -24,8 +26,6 @@ from nsm.results import (
     save_surface,
 )
 from nsm.results.render import View, rasterise, vertex_normals
-from nsm.surfaces import Surface
-from nsm.surfaces.surface import as_it_lies
 
 
 class Affine(nn.Module):

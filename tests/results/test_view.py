@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 
+from nsm.domains import Surface
 from nsm.maps import Rotated, build_planar
 from nsm.results import (
     NeuralSurface,
@@ -25,7 +26,6 @@ from nsm.results.analytic import analytic_surface
 from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import hit, pick, picked
 from nsm.results.view.scene import PLAIN, POSITION, UPS, Paint, scene_of
-from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import boundary_loops
 

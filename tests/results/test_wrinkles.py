@@ -5,9 +5,9 @@ import pytest
 import torch
 from torch import nn
 
+from nsm.domains import Surface
+from nsm.domains.surface import as_it_lies
 from nsm.results.wrinkles import normal_variation
-from nsm.surfaces import Surface
-from nsm.surfaces.surface import as_it_lies
 
 N = 64  # squares along each side of [-1, 1]²
 U, V = np.meshgrid(np.linspace(-1, 1, N + 1), np.linspace(-1, 1, N + 1), indexing="ij")

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from nsm.errors import NsmError
-from nsm.surfaces import Surface, topology
-from nsm.surfaces.correspondence import (
+from nsm.domains.base import at_fractions
+from nsm.domains.common_seams import (
     boundary_keys,
     corresponding_paths,
     edge_lengths,
@@ -14,9 +13,10 @@ from nsm.surfaces.correspondence import (
     seam_costs,
     turned_alike,
 )
+from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_jointly
+from nsm.errors import NsmError
+from nsm.surfaces import Surface, topology
 from nsm.surfaces.cutting import cut_along_paths
-from nsm.surfaces.domain import at_fractions
-from nsm.surfaces.joint_preparation import Mesh, matched_landmarks, prepare_jointly
 
 
 def ball(subdivisions=3):

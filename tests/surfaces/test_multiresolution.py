@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from nsm.surfaces import Surface, parameterization, shapes, topology
-from nsm.surfaces.coarsening import Rings, coarsen, present_faces, undo
-from nsm.surfaces.domain import boundary_positions
-from nsm.surfaces.flat import (
+from nsm.domains.base import boundary_positions
+from nsm.domains.coarse_to_fine import laid_out
+from nsm.domains.decimation import Rings, coarsen, present_faces, undo
+from nsm.domains.planar_mesh import (
     boundary_self_intersections,
     flipped_triangles,
     symmetric_dirichlet_per_face,
 )
-from nsm.surfaces.multiresolution import laid_out
-from nsm.surfaces.relaxation import Slopes, Stars, relax
-from nsm.surfaces.tutte import tutte
+from nsm.domains.tutte import tutte
+from nsm.domains.vertex_relaxation import Slopes, Stars, relax
+from nsm.surfaces import Surface, parameterization, shapes, topology
 
 
 def bumpy(n: int = 60) -> tuple[np.ndarray, np.ndarray]:

@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from thorough import examples
 
-from nsm.errors import NsmError
-from nsm.surfaces import Surface, cache, catalogue, catalogue_names, topology
-from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.flat import (
+from nsm.domains.planar_mesh import (
     boundary_self_intersections,
     flipped_triangles,
     symmetric_dirichlet_per_face,
 )
+from nsm.domains.tutte import tutte
+from nsm.errors import NsmError
+from nsm.surfaces import Surface, cache, catalogue, catalogue_names, topology
+from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.loading import load_mesh
-from nsm.surfaces.tutte import tutte
 
 SHAPES = ["plane", "hemisphere", "sphere", "torus", "cylinder", "cone", "saddle", "terrain"]
 

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from thorough import examples
 
+from nsm.domains.untangling import flipped, in_order, order_violations, untangled
 from nsm.surfaces.predicates import orientation
 from nsm.surfaces.shapes import grid_mesh, ring_mesh
 from nsm.surfaces.topology import boundary_loops
-from nsm.surfaces.untangle import flipped, in_order, order_violations, untangled
 
 DISC, DISC_FACES = ring_mesh(10)
 SQUARE, SQUARE_FACES = grid_mesh(12)
@@ -106,7 +106,7 @@ def test_what_cannot_be_untangled_is_given_back_for_the_caller_to_count():
 def test_a_boundary_is_put_in_order_along_the_domain(seed, size, domain):
     random = np.random.default_rng(seed)
     t = np.arange(40) / 40
-    from nsm.surfaces.domain import at_fractions, fractions_of
+    from nsm.domains.base import at_fractions, fractions_of
 
     rest = at_fractions(t, domain)
     jumbled = at_fractions(np.mod(t + 0.3 + size * (random.random(40) - 0.5), 1), domain)

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from nsm.config import compose_config
+from nsm.domains import Surface
+from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
 from nsm.maps import build_map
 from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
 from nsm.pipeline import build_overfit
 from nsm.results import pointwise_metrics
-from nsm.surfaces import Surface
-from nsm.surfaces.surface import as_it_lies
 from nsm.tasks.least_squares import _fit_tables, fit_linear_skip
 
 GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}

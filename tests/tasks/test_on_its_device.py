@@ -12,13 +12,13 @@ import torch
 
 from nsm.config import compose_config
 from nsm.data import Samples
+from nsm.domains import Surface
+from nsm.domains.joint_preparation import matched_landmarks
 from nsm.pipeline import build_overfit
 from nsm.pipeline.collection_map import build_collection_map
 from nsm.pipeline.pair_map import build_pair_map
 from nsm.pipeline.param import build_param
 from nsm.results import NeuralSurface
-from nsm.surfaces import Surface
-from nsm.surfaces.joint_preparation import matched_landmarks
 
 SMALL = ["encoding.resolutions=[4,8]", "map.width=8"]
 

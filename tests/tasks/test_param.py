@@ -9,11 +9,11 @@ from torch import nn
 
 import nsm
 from nsm.data import SurfaceSampler
+from nsm.domains import Surface
+from nsm.domains.baselines import BASELINES
 from nsm.errors import NsmError
 from nsm.maps.planar import PlanarMap
 from nsm.results import planar_metrics
-from nsm.surfaces import Surface
-from nsm.surfaces.baselines import BASELINES
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param

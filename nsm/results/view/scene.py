@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 
+from nsm.domains import Surface
 from nsm.results.artifact import NeuralSurface
 from nsm.results.metrics import vertex_error
 from nsm.results.pair_metrics import triangle_energies
@@ -17,7 +18,6 @@ from nsm.results.parameterization import Parameterization
 from nsm.results.pictures import GREY, vertex_means
 from nsm.results.render import vertex_normals, view_frame
 from nsm.results.surface_map import SurfaceMap
-from nsm.surfaces import Surface
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import edges_of
 

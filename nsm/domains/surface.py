@@ -12,16 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from nsm.domains.base import Domain, Keys
+from nsm.domains.embedding import check_method
+from nsm.domains.names import domain as domain_of
+from nsm.domains.names import stored as stored_domain
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies
-from nsm.surfaces.domain import DOMAIN_AREA, DOMAINS, Keys
-from nsm.surfaces.flat import boundary_self_intersections, flipped_triangles
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
-from nsm.surfaces.parameterization import METHODS, parameterize
 from nsm.surfaces.validation import CleanMesh, clean
 
 
@@ -34,7 +36,7 @@ class Surface:
         vertices: (V, 3) float64, centred, scaled so that the area is that of Ω (π or 4).
         faces: (F, 3) int64, counter-clockwise in Ω.
         uv: (V, 2) float64 in Ω, without flipped triangles.
-        domain: ``disc`` (unit disc) or ``square`` ([-1, 1]²).
+        domain: Ω.
         source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
         cut_vertex: (W,) int64, of each vertex of the mesh file the first vertex here that it, or
             the one that it was merged with, became; or -1 if it is not on the surface.
@@ -48,7 +50,7 @@ class Surface:
     vertices: np.ndarray = field(repr=False)
     faces: np.ndarray = field(repr=False)
     uv: np.ndarray = field(repr=False)
-    domain: str
+    domain: Domain
     source_vertex: np.ndarray = field(repr=False)
     cut_vertex: np.ndarray = field(repr=False)
     seam_pairs: np.ndarray = field(repr=False)
@@ -62,7 +64,7 @@ class Surface:
         cls,
         path_or_name: str | Path,
         *,
-        domain: str = "disc",
+        domain: str | Domain = "disc",
         seam_vertices: Sequence[int] | None = None,
         parameterization: str = "slim",
         cache: bool = True,
@@ -71,7 +73,7 @@ class Surface:
 
         Args:
             path_or_name: an OBJ, PLY, OFF, STL, GLTF or GLB file, or a catalogue name.
-            domain: ``disc`` or ``square``.
+            domain: Ω, or the name of one of :data:`nsm.domains.DOMAINS`.
             seam_vertices: vertices (numbers in the file) that the seam of the cut passes through;
                 without them, mutually far points are chosen where a seam is needed.
             parameterization: ``slim`` or ``tutte``.
@@ -110,7 +112,7 @@ class Surface:
         faces: np.ndarray,
         *,
         name: str = "mesh",
-        domain: str = "disc",
+        domain: str | Domain = "disc",
         seam_vertices: Sequence[int] | None = None,
         parameterization: str = "slim",
         cache: bool = False,
@@ -126,16 +128,11 @@ class Surface:
         Raises:
             NsmError: the mesh cannot be repaired, cut or flattened without flips.
         """
-        if domain not in DOMAINS:
-            raise NsmError(f"{name}: unknown domain '{domain}'; use one of {', '.join(DOMAINS)}")
-        if parameterization not in METHODS:
-            raise NsmError(
-                f"{name}: unknown parameterization '{parameterization}'; "
-                f"use one of {', '.join(METHODS)}"
-            )
+        domain = domain_of(domain)
+        check_method(parameterization, name)
         vertices, faces = as_arrays(vertices, faces, name)
         seam = None if seam_vertices is None else _numbers(seam_vertices, f"{name}: seam_vertices")
-        options = {"domain": domain, "seam": seam, "method": parameterization}
+        options = {"domain": stored_domain(domain), "seam": seam, "method": parameterization}
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         if stored is not None:
@@ -151,7 +148,7 @@ class Surface:
         vertices: np.ndarray,
         faces: np.ndarray,
         name: str,
-        domain: str,
+        domain: Domain,
         seam: list[int] | None,
         method: str,
         log: Sequence[str],
@@ -176,7 +173,7 @@ class Surface:
         mesh: CleanMesh,
         *,
         name: str = "mesh",
-        domain: str = "disc",
+        domain: str | Domain = "disc",
         parameterization: str = "slim",
         keys: Keys | None = None,
         log: Sequence[str] = (),
@@ -193,16 +190,15 @@ class Surface:
             NsmError: the mesh cannot be flattened without flips.
         """
         start = time.perf_counter()
+        domain = domain_of(domain)
         center = 0.5 * (cut.vertices.min(axis=0) + cut.vertices.max(axis=0))
         centred = cut.vertices - center
         area = float(topology.face_areas(centred, cut.faces).sum())
-        scale = float(np.sqrt(DOMAIN_AREA[domain] / area))
+        scale = float(np.sqrt(domain.area / area))
         normalised = centred * scale
-        flat = parameterize(
-            normalised, cut.faces, domain=domain, method=parameterization, name=name, keys=keys
-        )
+        flat = domain.embed(normalised, cut.faces, method=parameterization, name=name, keys=keys)
         flipped = flipped_triangles(flat.uv, cut.faces)
-        crossings = boundary_self_intersections(flat.uv, cut.loop)
+        crossings = boundary_self_intersections(flat.uv, cut.loop) if domain.has_boundary else 0
         if flipped or crossings:
             raise NsmError(
                 f"{name}: the parameterization is not injective ({flipped} flipped triangles, "
@@ -248,7 +244,7 @@ class Surface:
         }
 
     @classmethod
-    def from_stored(cls, name: str, domain: str, stored: dict[str, np.ndarray]) -> Surface:
+    def from_stored(cls, name: str, domain: str | Domain, stored: dict[str, np.ndarray]) -> Surface:
         """The surface of arrays that :meth:`to_stored` gave."""
         words: dict[str, Any] = json.loads(stored["words"].tobytes())
         return cls(
@@ -256,7 +252,7 @@ class Surface:
             vertices=stored["vertices"],
             faces=stored["faces"],
             uv=stored["uv"],
-            domain=domain,
+            domain=domain_of(domain),
             source_vertex=stored["source_vertex"],
             cut_vertex=stored["cut_vertex"],
             seam_pairs=stored["seam_pairs"],
@@ -273,7 +269,7 @@ class Surface:
 
     def content_key(self) -> str:
         """Hash of the geometry and its parameterization: equal surfaces, equal keys."""
-        digest = hashlib.sha256(self.domain.encode())
+        digest = hashlib.sha256(str(stored_domain(self.domain)).encode())
         for array in (self.vertices, self.uv):
             digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
         digest.update(np.ascontiguousarray(self.faces, dtype="<i8").tobytes())
@@ -312,7 +308,7 @@ def as_it_lies(
     vertices: np.ndarray,
     faces: np.ndarray,
     uv: np.ndarray,
-    domain: str,
+    domain: str | Domain,
     seam_pairs: np.ndarray | None = None,
 ) -> Surface:
     """A disc that is laid out already, in its own units and place; nothing is checked."""
@@ -321,7 +317,7 @@ def as_it_lies(
         vertices=vertices,
         faces=faces,
         uv=uv,
-        domain=domain,
+        domain=domain_of(domain),
         source_vertex=np.arange(len(uv)),
         cut_vertex=np.arange(len(uv)),
         seam_pairs=np.zeros((0, 2), dtype=np.int64) if seam_pairs is None else seam_pairs,

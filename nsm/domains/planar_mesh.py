@@ -47,31 +47,20 @@ def boundary_self_intersections(uv: np.ndarray, loop: np.ndarray) -> int:
     return total
 
 
-def symmetric_dirichlet_per_face(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, eps: float = 0.01
-) -> np.ndarray:
-    """tr(M) + tr((M + eps I)^-1) per face (F,), M = J'J of the map from uv (V,2) to 3D.
+def flipped(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Mask (F,) of the triangles of a flat mesh (V, 2) that are not counter-clockwise, exactly."""
+    a, b, c = (uv[faces[:, k]] for k in range(3))
+    return orientation(a, b, c) <= 0
 
-    About 4 where the map is an isometry; inf where a triangle of uv has no area.
+
+def order_violations(points: np.ndarray) -> int:
+    """How often a closed polygon (B, 2) fails to go once around the origin, counter-clockwise.
+
+    Zero, by exact signs, means that each side is seen counter-clockwise from the origin and that
+    the turns add up to one: the polygon is then star-shaped, so it does not cross itself.
     """
-    a, b, c = (faces[:, k] for k in range(3))
-    flat = np.stack([uv[b] - uv[a], uv[c] - uv[a]], axis=2)
-    space = np.stack([vertices[b] - vertices[a], vertices[c] - vertices[a]], axis=2)
-    determinant = flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = (
-            np.stack(
-                [
-                    np.stack([flat[:, 1, 1], -flat[:, 0, 1]], axis=1),
-                    np.stack([-flat[:, 1, 0], flat[:, 0, 0]], axis=1),
-                ],
-                axis=1,
-            )
-            / determinant[:, None, None]
-        )
-        jacobian = space @ inverse
-        metric = np.swapaxes(jacobian, 1, 2) @ jacobian
-        trace = metric[:, 0, 0] + metric[:, 1, 1]
-        p, r = metric[:, 0, 0] + eps, metric[:, 1, 1] + eps
-        value = trace + (p + r) / (p * r - metric[:, 0, 1] ** 2)
-    return np.where(determinant != 0, value, np.inf)
+    following = np.roll(points, -1, axis=0)
+    backward = orientation(points, following, np.zeros(2)) <= 0
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    turns = np.mod(np.roll(angle, -1) - angle, 2 * np.pi)[~backward].sum() / (2 * np.pi)
+    return int(backward.sum()) or abs(round(turns) - 1)

@@ -9,10 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nsm.errors import NsmError
-from nsm.surfaces import cache as cache_
-from nsm.surfaces import topology
-from nsm.surfaces.correspondence import (
+from nsm.domains.base import BoundedDomain, Domain, Keys
+from nsm.domains.common_seams import (
     SEAMS,
     boundary_keys,
     corresponding_paths,
@@ -20,16 +18,22 @@ from nsm.surfaces.correspondence import (
     seam_costs,
     turned_alike,
 )
+from nsm.domains.disc import Disc
+from nsm.domains.names import bounded
+from nsm.domains.names import domain as domain_of
+from nsm.domains.names import stored as stored_domain
+from nsm.domains.surface import Surface
+from nsm.errors import NsmError
+from nsm.surfaces import cache as cache_
+from nsm.surfaces import topology
 from nsm.surfaces.cutting import Cut, cut_along_paths
-from nsm.surfaces.domain import DOMAIN_AREA, Keys, at_fractions, fractions_of
 from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.location import locate
-from nsm.surfaces.parameterization import parameterize
-from nsm.surfaces.surface import Surface
 from nsm.surfaces.validation import CleanMesh, clean
 
 # auto: shares of the landmarks that the seam is tried through
 _SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
+_DISC = Disc()  # where seams are compared, whatever the domain
 _WORST = 1e3  # a triangle's distortion counts no more than this
 
 
@@ -47,7 +51,7 @@ def prepare_jointly(
     meshes: Sequence[Mesh],
     landmarks: Sequence[np.ndarray],
     *,
-    domain: str = "disc",
+    domain: str | Domain = "disc",
     parameterization: str = "slim",
     seam: str = "auto",
     seam_landmarks: int | None = None,
@@ -71,6 +75,7 @@ def prepare_jointly(
     Raises:
         NsmError: a mesh that cannot be prepared, or no corresponding seams.
     """
+    domain = domain_of(domain)
     cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
     closed = all(
@@ -96,7 +101,7 @@ def prepare_jointly(
             digest.update(np.ascontiguousarray(array).tobytes())
     options = {
         "together": digest.hexdigest(),
-        "domain": domain,
+        "domain": stored_domain(domain),
         "method": parameterization,
         "seam": [seam, seam_landmarks],
     }
@@ -140,7 +145,7 @@ def _cut_alike(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
-    domain: str,
+    domain: Domain,
     method: str,
     seam: str,
     seam_landmarks: int | None,
@@ -170,7 +175,7 @@ def _cut_alike(
             "no seams through the landmarks were found: some are too close together for the "
             "meshes' edges; leave one of them out, or subdivide the mesh"
         )
-    fractions = common_fractions(best.cuts, best.keys, domain)
+    fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     words = (
         f"seam led along {best.seam} paths through {best.count} of {total} landmarks, alike on "
         "all meshes"
@@ -227,7 +232,7 @@ def _disagreement(way: _CutAlike, landmarks: Sequence[np.ndarray]) -> float:
         [_arc_lengths(cut, key) for cut, key in zip(way.cuts, way.keys, strict=True)], axis=0
     )
     flat = [
-        parameterize(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
+        _DISC.embed(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
         for cut, key in zip(_of_unit_area(way.cuts), way.keys, strict=True)
     ]
     places = []
@@ -249,9 +254,7 @@ def _disagreement(way: _CutAlike, landmarks: Sequence[np.ndarray]) -> float:
 
 def _of_unit_area(cuts: Sequence[Cut]) -> list[Cut]:
     """The discs scaled to the area of Ω, as the distortion wants them."""
-    scales = [
-        np.sqrt(DOMAIN_AREA["disc"] / topology.face_areas(c.vertices, c.faces).sum()) for c in cuts
-    ]
+    scales = [np.sqrt(_DISC.area / topology.face_areas(c.vertices, c.faces).sum()) for c in cuts]
     return [replace(c, vertices=c.vertices * s) for c, s in zip(cuts, scales, strict=True)]
 
 
@@ -265,33 +268,22 @@ def _arc_lengths(cut: Cut, keys: np.ndarray) -> np.ndarray:
     return along[[place[int(v)] for v in keys]]
 
 
-def common_fractions(cuts: Sequence[Cut], keys: Sequence[np.ndarray], domain: str) -> np.ndarray:
+def common_fractions(
+    cuts: Sequence[Cut], keys: Sequence[np.ndarray], domain: BoundedDomain
+) -> np.ndarray:
     """Places (K,) on ∂Ω, as fractions of the way around, that suit the keys of all discs.
 
     Each disc is flattened with its boundary free to slide; the gaps between its keys are averaged
-    over the discs. On the square the keys nearest to the corners become the corners.
+    over the discs. The keys nearest to the domain's corners become the corners.
     """
     gaps = []
     for cut, key in zip(_of_unit_area(cuts), keys, strict=True):
-        uv = parameterize(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
+        uv = _DISC.embed(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
         angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
         gaps.append((np.roll(angle, -1) - angle) % 1.0)
     mean = np.mean(gaps, axis=0)
     fractions = np.concatenate([[0.0], np.cumsum(mean / mean.sum())[:-1]])
-    return _through_corners(fractions) if domain == "square" else fractions
-
-
-def _through_corners(fractions: np.ndarray) -> np.ndarray:
-    """Fractions (K,) warped so that four keys near the quarters come to be the corners."""
-    count = len(fractions)
-    if count < 4:
-        return fractions
-    corners = [0]
-    for quarter in (1, 2, 3):
-        nearest = int(np.abs(fractions - quarter / 4).argmin())
-        # each corner needs a key of its own
-        corners.append(min(max(nearest, corners[-1] + 1), count - 4 + quarter))
-    return np.interp(fractions, [*fractions[corners], 1.0], [0.0, 0.25, 0.5, 0.75, 1.0])
+    return domain.through_corners(fractions)
 
 
 @dataclass(frozen=True)
@@ -307,7 +299,7 @@ class Matched:
     numbers: np.ndarray
     on_boundary: int
 
-    def seam(self, domain: str, count: int) -> np.ndarray:
+    def seam(self, domain: BoundedDomain, count: int) -> np.ndarray:
         """(T, 2, 2) pairs of points of ∂Ω that are one point of each surface, if cut alike.
 
         Between the landmarks at its ends, each branch of the seam is walked along twice, there
@@ -315,7 +307,7 @@ class Matched:
         their shares of the ways. Nothing is paired where the walk is not around a tree.
         """
         numbers = self.numbers[: self.on_boundary].tolist()
-        t = fractions_of(self.points[0][: self.on_boundary], domain)
+        t = domain.boundary_fractions(self.points[0][: self.on_boundary])
         ways = {
             (numbers[k], numbers[(k + 1) % len(numbers)]): (
                 t[k],
@@ -328,9 +320,9 @@ class Matched:
         for (a, b), (begin, span) in ways.items():
             if a < b and (b, a) in ways:
                 back, width = ways[b, a]
-                there = at_fractions((begin + span * share) % 1.0, domain)
+                ways_out_and_back = (begin + span * share, back + width * (1 - share))
                 pairs.append(
-                    np.stack([there, at_fractions((back + width * (1 - share)) % 1.0, domain)], 1)
+                    np.stack([domain.boundary_points(w % 1.0) for w in ways_out_and_back], 1)
                 )
         return np.concatenate(pairs) if pairs else np.zeros((0, 2, 2))
 

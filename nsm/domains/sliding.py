@@ -6,11 +6,16 @@ soft constraints cannot promise.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.sparse import coo_matrix, diags
 
-from nsm.surfaces.flat import flipped_triangles
-from nsm.surfaces.tutte import factorise
+from nsm.domains.planar_mesh import flipped_triangles
+from nsm.domains.tutte import factorise
+
+if TYPE_CHECKING:
+    from nsm.domains.base import BoundedDomain
 
 
 def slide(
@@ -18,7 +23,7 @@ def slide(
     faces: np.ndarray,
     uv: np.ndarray,
     loop: np.ndarray,
-    domain: str,
+    domain: BoundedDomain,
     steps: int,
     held: np.ndarray,
 ) -> np.ndarray:
@@ -100,7 +105,7 @@ def _proxy_step(
     uv: np.ndarray,
     inner: np.ndarray,
     moving: np.ndarray,
-    domain: str,
+    domain: BoundedDomain,
 ) -> np.ndarray | None:
     """Minimiser of the proxy: steps of inner vertices (2 each, x then y), then of moving ones."""
     u, s, vt = np.linalg.svd(_jacobians(gradient, faces, uv))
@@ -126,7 +131,7 @@ def _proxy_step(
     g = np.zeros(2 * n)
     np.add.at(g, index.ravel(), force.ravel())
     # columns of freedom: both coordinates inside, the tangent on the boundary
-    tangent = _tangents(uv[moving], domain)
+    tangent = domain.tangents(uv[moving])
     k, m = len(inner), len(moving)
     freedom = coo_matrix(
         (
@@ -156,7 +161,7 @@ def _collapse_step(
     faces: np.ndarray,
     inner: np.ndarray,
     moving: np.ndarray,
-    domain: str,
+    domain: BoundedDomain,
 ) -> float:
     """The step at which the first triangle loses its area (Smith and Schaefer 2015), or inf.
 
@@ -165,7 +170,7 @@ def _collapse_step(
     k = len(inner)
     displacement = np.zeros_like(uv)
     displacement[inner] = direction[: 2 * k].reshape(2, k).T
-    displacement[moving] = direction[2 * k :, None] * _tangents(uv[moving], domain)
+    displacement[moving] = direction[2 * k :, None] * domain.tangents(uv[moving])
     a, b, c = (uv[faces[:, i]] for i in range(3))
     da, db, dc = (displacement[faces[:, i]] for i in range(3))
     # twice the area at step t is p t^2 + q t + r with r > 0
@@ -185,33 +190,18 @@ def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
 
 
-def _tangents(points: np.ndarray, domain: str) -> np.ndarray:
-    """Unit directions (B,2) in which boundary points may slide, counter-clockwise on the disc."""
-    if domain == "disc":
-        return np.stack([-points[:, 1], points[:, 0]], axis=1)
-    on_vertical = np.abs(points[:, 0]) > np.abs(points[:, 1])
-    return np.stack([~on_vertical, on_vertical], axis=1).astype(np.float64)
-
-
 def _move(
     uv: np.ndarray,
     direction: np.ndarray,
     step: float,
     inner: np.ndarray,
     moving: np.ndarray,
-    domain: str,
+    domain: BoundedDomain,
 ) -> np.ndarray:
     k = len(inner)
     moved = uv.copy()
     moved[inner] += step * direction[: 2 * k].reshape(2, k).T
-    along = step * direction[2 * k :]
-    if domain == "disc":
-        angle = np.arctan2(uv[moving, 1], uv[moving, 0]) + along
-        moved[moving] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    else:
-        moved[moving] = (uv[moving] + along[:, None] * _tangents(uv[moving], domain)).clip(
-            -1.0, 1.0
-        )
+    moved[moving] = domain.slide(uv[moving], step * direction[2 * k :])
     return moved
 
 

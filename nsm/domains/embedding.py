@@ -6,26 +6,26 @@ symmetric Dirichlet energy: libigl's with the boundary held, which is fast, and 
 steps, in which boundary vertices slide along the boundary of the domain. Our steps keep the
 boundary exactly on the domain's and never accept a flipped triangle, which libigl's soft
 constraints cannot promise. Large meshes are laid out coarse first
-(:mod:`nsm.surfaces.multiresolution`).
+(:mod:`nsm.domains.coarse_to_fine`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nsm.domains.coarse_to_fine import laid_out
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
+from nsm.domains.sliding import slide
+from nsm.domains.tutte import tutte
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.domain import DOMAINS, Keys, boundary_positions
-from nsm.surfaces.flat import (
-    boundary_self_intersections,
-    flipped_triangles,
-    symmetric_dirichlet_per_face,
-)
-from nsm.surfaces.multiresolution import laid_out
-from nsm.surfaces.sliding import slide
-from nsm.surfaces.tutte import tutte
+from nsm.surfaces.geometry import triangle_distortion
+
+if TYPE_CHECKING:
+    from nsm.domains.base import BoundedDomain, Keys
 
 # slim_held: SLIM without the sliding steps after it, a quick look at what slim would give
 METHODS = ("tutte", "slim_held", "slim")
@@ -34,7 +34,7 @@ LARGE, COARSE = 40_000, 12_000
 
 
 @dataclass(frozen=True)
-class Parameterization:
+class Embedding:
     """uv (V,2) in the domain; medians of symmetric Dirichlet, its own and that of Tutte's embedding
     (for a mesh laid out coarse first, of the coarse one); log."""
 
@@ -44,33 +44,29 @@ class Parameterization:
     log: tuple[str, ...]
 
 
-def parameterize(
+def embed(
+    domain: BoundedDomain,
     vertices: np.ndarray,
     faces: np.ndarray,
     *,
-    domain: str = "disc",
     method: str = "slim",
     name: str = "mesh",
     keys: Keys | None = None,
-) -> Parameterization:
+) -> Embedding:
     """Map a disc-shaped mesh (V,3), (F,3) injectively onto the domain.
 
-    The mesh should have the area of the domain. Keys stay where they are said to be. NsmError
-    for an unknown domain or method, or if even Tutte's embedding has flipped triangles in
-    floating point.
+    The mesh should have the area of the domain. Keys stay in their places.
+
+    Raises:
+        NsmError: ``unknown_option``, an unknown method; ``not_injective``, even Tutte's embedding
+            has flipped triangles in floating point.
     """
-    if domain not in DOMAINS:
-        raise NsmError(f"{name}: unknown domain '{domain}'; use one of {', '.join(DOMAINS)}")
-    if method not in METHODS:
-        raise NsmError(
-            f"{name}: unknown parameterization '{method}'; use one of {', '.join(METHODS)}"
-        )
+    check_method(method, name)
     log: list[str] = []
     loop = topology.boundary_loops(faces)[0]
-    boundary = boundary_positions(vertices, loop, domain, name, keys)
+    boundary = domain.place_boundary(vertices, loop, name, keys)
     held = np.zeros(len(vertices), dtype=bool)
-    if domain == "square":
-        held[loop[np.abs(boundary).min(axis=1) == 1.0]] = True
+    held[loop[domain.at_corner(boundary)]] = True
     if keys is not None:
         held[keys.vertices] = True
 
@@ -107,7 +103,17 @@ def parameterize(
             log[:] = ["a coarse mesh's layout did not carry over: laid out at once"]
     if uv is None:
         uv = solve(vertices, faces, loop, boundary, held)
-    return Parameterization(uv, _median_distortion(vertices, faces, uv), before, tuple(log))
+    return Embedding(uv, _median_distortion(vertices, faces, uv), before, tuple(log))
+
+
+def check_method(method: str, name: str) -> None:
+    """NsmError for a method that is none of :data:`METHODS`."""
+    if method not in METHODS:
+        raise NsmError(
+            f"{name}: unknown parameterization {method!r}; use one of {', '.join(METHODS)}",
+            kind="unknown_option",
+            key="parameterization",
+        )
 
 
 def _start(
@@ -127,7 +133,9 @@ def _start(
     if flipped:
         raise NsmError(
             f"{name}: {flipped} triangles flip in Tutte's embedding (parts too long and thin for "
-            "floating point); give seam_vertices at the tips of long parts"
+            "floating point); give seam_vertices at the tips of long parts",
+            kind="not_injective",
+            key=name,
         )
     return start
 
@@ -177,4 +185,4 @@ def _sliding_steps(n_faces: int) -> int:
 
 
 def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:
-    return float(np.median(symmetric_dirichlet_per_face(vertices, faces, uv)))
+    return float(np.median(triangle_distortion(uv, vertices, faces)))

@@ -13,8 +13,7 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from nsm.surfaces.domain import at_fractions, fractions_of
-from nsm.surfaces.predicates import orientation
+from nsm.domains.planar_mesh import flipped
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
@@ -22,25 +21,6 @@ _ROUNDS, _ITERATIONS = 20, 100
 _ROOM = 1e-6
 # of the distance that two neighbours on the boundary have before the map: kept after it
 _GAP = 0.02
-
-
-def flipped(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Mask (F,) of the triangles of a flat mesh (V, 2) that are not counter-clockwise, exactly."""
-    a, b, c = (uv[faces[:, k]] for k in range(3))
-    return orientation(a, b, c) <= 0
-
-
-def order_violations(points: np.ndarray) -> int:
-    """How often a closed polygon (B, 2) fails to go once around the origin, counter-clockwise.
-
-    Zero, by exact signs, means that each side is seen counter-clockwise from the origin and that
-    the turns add up to one: the polygon is then star-shaped, so it does not cross itself.
-    """
-    following = np.roll(points, -1, axis=0)
-    backward = orientation(points, following, np.zeros(2)) <= 0
-    angle = np.arctan2(points[:, 1], points[:, 0])
-    turns = np.mod(np.roll(angle, -1) - angle, 2 * np.pi)[~backward].sum() / (2 * np.pi)
-    return int(backward.sum()) or abs(round(turns) - 1)
 
 
 def untangled(
@@ -172,25 +152,23 @@ def _energy(
     return float((top / chi).sum()), gradient
 
 
-def in_order(points: np.ndarray, rest: np.ndarray, domain: str) -> np.ndarray:
-    """Points of ∂Ω (B, 2), moved along it into the order of a loop where they are not.
+def order_shifts(now: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far the points of a loop must move along a closed curve to be in order.
 
-    The nearest increasing fractions of the way around ∂Ω (isotonic regression) take their place,
-    at distances of at least a small share of what they are before the map.
+    The nearest increasing fractions (isotonic regression) keep distances of at least a small share
+    of those before the map.
 
     Args:
-        points: where a map sends the loop's vertices, which should go around Ω once.
-        rest: (B, 2) where they are before, in order.
-        domain: ``disc`` or ``square``.
+        now: (B,) fractions of the way around, where a map sends the loop's vertices.
+        before: (B,) rising fractions before the map.
 
     Returns:
-        (B, 2); equal to ``points`` where these do not go around once, which no small change mends.
+        which points (M,) move, and their shifts (M,); none where the loop does not go around once.
     """
-    before, now = fractions_of(rest, domain), fractions_of(points, domain)
     gap = _GAP * np.mod(np.roll(before, -1) - before, 1.0)
     step = np.mod(np.roll(now, -1) - now + 0.5, 1.0) - 0.5
     if round(step.sum()) != 1:
-        return points
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
     # how far around each point is, less the gaps: what should not decrease; over three turns
     turn = 1.0 - gap.sum()
     once = np.concatenate([[0.0], np.cumsum(step - gap)[:-1]])
@@ -202,8 +180,5 @@ def in_order(points: np.ndarray, rest: np.ndarray, domain: str) -> np.ndarray:
     first = int(np.argmin((highest - lowest)[n : 2 * n]))
     piece = along[n + first : 2 * n + first]
     better = isotonic_regression(piece).x.clip(piece[0], piece[0] + turn)
-    index = (first + np.flatnonzero(better != piece)) % n
-    result = points.copy()
-    shift = (better - piece)[better != piece]
-    result[index] = at_fractions(np.mod(now[index] + shift, 1.0), domain)
-    return result
+    moved = better != piece
+    return (first + np.flatnonzero(moved)) % n, (better - piece)[moved]

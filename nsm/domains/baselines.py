@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from nsm.domains.disc import Disc
+from nsm.domains.planar_mesh import signed_areas
 from nsm.surfaces import topology
-from nsm.surfaces.domain import boundary_positions
-from nsm.surfaces.flat import signed_areas
 
 SLIM_ITERATIONS = 200
 ARAP_ROUNDS = 30
@@ -33,7 +33,7 @@ def harmonic(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray) -> np.n
     import igl
 
     loop = topology.boundary_loops(faces)[0]
-    circle = boundary_positions(vertices, loop, "disc")
+    circle = Disc().place_boundary(vertices, loop)
     return igl.harmonic(vertices, faces, loop, circle, 1)
 
 

@@ -1,6 +1,6 @@
 """Flat meshes whose vertices move one by one to where their triangles are least distorted.
 
-The energy is that of :mod:`nsm.surfaces.sliding`: symmetric Dirichlet, weighted by the
+The energy is that of :mod:`nsm.domains.sliding`: symmetric Dirichlet, weighted by the
 area on the mesh. Vertices that are no neighbours move at once; a step that would flip a triangle
 or not lower the energy is shortened, or not made.
 """
@@ -8,11 +8,15 @@ or not lower the energy is shortened, or not made.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nsm.domains.decimation import Rings
 from nsm.surfaces import topology
-from nsm.surfaces.coarsening import Rings
+
+if TYPE_CHECKING:
+    from nsm.domains.base import BoundedDomain
 
 _TRIES, _SHORTER = 4, 0.35
 _COLOURS = 64
@@ -114,49 +118,41 @@ class Stars:
         )
 
 
-class Slopes:
-    """Where vertices may move: freely, or, those of a mask (V,), along ∂Ω; some not at all."""
+@dataclass(frozen=True)
+class Freedom:
+    """Where vertices may move: those of a mask (V,) along ∂Ω, held ones not at all, the others
+    freely."""
 
-    def __init__(self, rim: np.ndarray, held: np.ndarray, domain: str) -> None:
-        self.boundary, self.held, self.domain = rim, held, domain
+    on_boundary: np.ndarray
+    held: np.ndarray
+    domain: BoundedDomain
 
-    def tangent(self, uv: np.ndarray) -> np.ndarray:
-        if self.domain == "disc":
-            return np.stack([-uv[:, 1], uv[:, 0]], axis=1)
-        on_vertical = np.abs(uv[:, 0]) > np.abs(uv[:, 1])
-        return np.stack([~on_vertical, on_vertical], axis=1).astype(np.float64)
-
-    def back(self, points: np.ndarray, rim: np.ndarray) -> np.ndarray:
-        """Points (N, 2), those of a mask (N,) brought back to ∂Ω."""
-        on = points[rim]
-        if self.domain == "disc":
-            points[rim] = on / np.linalg.norm(on, axis=1, keepdims=True)
-        else:
-            points[rim] = on.clip(-1.0, 1.0)
+    def retract(self, points: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Points (N, 2), changed in place: those of a mask (N,) are brought back to ∂Ω."""
+        points[which] = self.domain.retract(points[which])
         return points
 
 
-def relax(uv: np.ndarray, stars: Stars, slopes: Slopes) -> None:
+def relax(uv: np.ndarray, stars: Stars, freedom: Freedom) -> None:
     """One Newton step of each of the stars' vertices, within uv (V, 2)."""
     energy, gradient, second = stars.derivatives(uv)
-    rim, here = slopes.boundary[stars.vertex], uv[stars.vertex]
+    rim, here = freedom.on_boundary[stars.vertex], uv[stars.vertex]
     direction = _newton(gradient, second)
     if rim.any():
-        t, g, h = slopes.tangent(here[rim]), gradient[rim], second[rim]
+        t, g, h = freedom.domain.tangents(here[rim]), gradient[rim], second[rim]
         along = (g * t).sum(axis=1)
         bend = h[:, 0] * t[:, 0] ** 2 + 2 * h[:, 1] * t[:, 0] * t[:, 1] + h[:, 2] * t[:, 1] ** 2
-        if slopes.domain == "disc":
-            bend = bend - (g * here[rim]).sum(axis=1)
+        bend = bend + (g * freedom.domain.curvature(here[rim])).sum(axis=1)
         bend = np.maximum(bend, 0.1 * np.abs(h[:, 0] + h[:, 2]))
         direction[rim] = -(along / bend)[:, None] * t
     size = np.minimum(1.0, 0.8 * _first_collapse(uv, stars, direction))
-    active = np.isfinite(direction).all(axis=1) & ~slopes.held[stars.vertex]
+    active = np.isfinite(direction).all(axis=1) & ~freedom.held[stars.vertex]
     some, index = stars.chosen(active), np.flatnonzero(active)
     for _ in range(_TRIES):
         if len(index) == 0:
             return
         trial = here[index] + size[index, None] * direction[index]
-        trial = slopes.back(trial, rim[index])
+        trial = freedom.retract(trial, rim[index])
         better = some.energy(uv, trial) < energy[index]
         uv[some.vertex[better]] = trial[better]
         size[index] *= _SHORTER
@@ -189,7 +185,7 @@ def _first_collapse(uv: np.ndarray, stars: Stars, direction: np.ndarray) -> np.n
 
 
 def sweep(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, slopes: Slopes, sweeps: int
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, freedom: Freedom, sweeps: int
 ) -> None:
     """Relax all vertices that the faces (F, 3) name, one independent set after the other.
 
@@ -211,7 +207,7 @@ def sweep(
         groups.append(Stars.of(vertices, members, number[owner[mine]], b[mine], c[mine]))
     for _ in range(sweeps):
         for stars in groups:
-            relax(uv, stars, slopes)
+            relax(uv, stars, freedom)
 
 
 def _colours(faces: np.ndarray, n: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Large meshes laid out coarse first: the coarse mesh is solved for, the rest is put back in.
 
-Each round of :mod:`nsm.surfaces.coarsening` is undone in the plane without a flip, and what was
+Each round of :mod:`nsm.domains.decimation` is undone in the plane without a flip, and what was
 put back, and from time to time everything, is relaxed. Time and memory grow with the mesh alone,
 not with the fill of a factorised matrix.
 """
@@ -8,12 +8,16 @@ not with the fill of a factorised matrix.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nsm.domains.decimation import Round, coarsen, present_faces, undo
+from nsm.domains.vertex_relaxation import Freedom, Stars, relax, sweep
 from nsm.surfaces import topology
-from nsm.surfaces.coarsening import Round, coarsen, present_faces, undo
-from nsm.surfaces.relaxation import Slopes, Stars, relax, sweep
+
+if TYPE_CHECKING:
+    from nsm.domains.base import BoundedDomain
 
 _GROWTH = 2.0  # of the faces between two sweeps over all vertices
 _SWEEPS = 8
@@ -27,7 +31,7 @@ def laid_out(
     faces: np.ndarray,
     loop: np.ndarray,
     boundary: np.ndarray,
-    domain: str,
+    domain: BoundedDomain,
     held: np.ndarray,
     solve: Callable[..., np.ndarray],
     count: int,
@@ -36,7 +40,7 @@ def laid_out(
 
     Args:
         loop, boundary: the boundary's vertices (B,), and where the coarse mesh's start (B, 2).
-        domain: ``disc`` or ``square``.
+        domain: Ω.
         held: (V,) mask of boundary vertices that stay where ``boundary`` has them.
         solve: lays out the coarse mesh, without flips; from what is given here of it, the domain
             aside, to its coordinates.
@@ -55,21 +59,21 @@ def laid_out(
     uv[ids] = solve(points, local[coarse], rim_left, boundary[left], held[ids])
     rim = np.zeros(len(vertices), dtype=bool)
     rim[loop] = True
-    slopes = Slopes(rim, held, domain)
+    freedom = Freedom(rim, held, domain)
     swept = len(coarse)
     for step in reversed(rounds):
         undo(current, step)
-        if not _put_back(vertices, current, uv, slopes, step):
+        if not _put_back(vertices, current, uv, freedom, step):
             return None
         present = present_faces(current)
         if len(present) >= _GROWTH * swept or step is rounds[0]:
             swept = len(present)
-            sweep(vertices, present, uv, slopes, _SWEEPS)
+            sweep(vertices, present, uv, freedom, _SWEEPS)
     return uv
 
 
 def _put_back(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, slopes: Slopes, step: Round
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, freedom: Freedom, step: Round
 ) -> bool:
     """Give a round's vertices places in uv (V, 2) that flip no triangle; whether that was done."""
     face, k = step.corners // 3, step.corners % 3
@@ -78,24 +82,24 @@ def _put_back(
     inner = step.before < 0
     place = np.empty((len(step.vertex), 2))
     place[inner] = _mean_values(vertices, uv, stars)[inner]
-    place[~inner] = _between(vertices, uv, slopes, step, ~inner)
-    fits = _placed(uv, stars, step, place, slopes)
+    place[~inner] = _between(vertices, uv, freedom, step, ~inner)
+    fits = _placed(uv, stars, step, place, freedom)
     # near the target there is always room, but not in every direction
     left, step_left = stars.chosen(~fits), step.chosen(~fits)
     if (
         len(left.vertex)
         and not _placed(
-            uv, left, step_left, _inwards(uv, left, step_left, place[~fits]), slopes
+            uv, left, step_left, _inwards(uv, left, step_left, place[~fits]), freedom
         ).all()
     ):
         return False
     for _ in range(_STEPS):
-        relax(uv, stars, slopes)
+        relax(uv, stars, freedom)
     return True
 
 
 def _placed(
-    uv: np.ndarray, stars: Stars, step: Round, place: np.ndarray, slopes: Slopes
+    uv: np.ndarray, stars: Stars, step: Round, place: np.ndarray, freedom: Freedom
 ) -> np.ndarray:
     """Move each star's vertex to its place (N, 2), or as near to it from its target as it flips
     nothing; mask (N,) of those that found a place."""
@@ -106,7 +110,7 @@ def _placed(
             break
         target, rim = uv[step.target[missing]], step.before[missing] >= 0
         trial = target + share * (place[missing] - target)
-        trial = _on_rim(trial, target, place[missing], rim, slopes)
+        trial = _on_rim(trial, target, place[missing], rim, freedom)
         fits = np.isfinite(stars.energy(uv, trial))
         uv[stars.vertex[fits]] = trial[fits]
         found[missing[fits]] = True
@@ -150,7 +154,7 @@ def _mean_values(vertices: np.ndarray, uv: np.ndarray, stars: Stars) -> np.ndarr
 
 
 def _between(
-    vertices: np.ndarray, uv: np.ndarray, slopes: Slopes, step: Round, which: np.ndarray
+    vertices: np.ndarray, uv: np.ndarray, freedom: Freedom, step: Round, which: np.ndarray
 ) -> np.ndarray:
     """Places (K, 2) on ∂Ω between two neighbours, at the shares of length that the mesh has."""
     v, w, a = step.vertex[which], step.target[which], step.before[which]
@@ -161,8 +165,8 @@ def _between(
 
 
 def _on_rim(
-    trial: np.ndarray, one: np.ndarray, other: np.ndarray, rim: np.ndarray, slopes: Slopes
+    trial: np.ndarray, one: np.ndarray, other: np.ndarray, rim: np.ndarray, freedom: Freedom
 ) -> np.ndarray:
     """Points of chords (N, 2), those of a mask brought to ∂Ω; a side of the square is kept to."""
     same = rim[:, None] & (one == other)
-    return slopes.back(np.where(same, one, trial), rim)
+    return freedom.retract(np.where(same, one, trial), rim)
