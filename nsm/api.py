@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from nsm.config import compose_config, conf_folder, unknown_setting
 from nsm.config_docs import known_keys
+from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
 from nsm.instantiation import target_of
 from nsm.pipeline import Given, run_task
@@ -27,7 +28,6 @@ from nsm.results import (
     load_surface_map,
 )
 from nsm.run_directories import passing_folder
-from nsm.surfaces import Surface
 from nsm.sweeps import is_complete
 
 
@@ -276,15 +276,17 @@ class _Request:
 def _plain(value: Any) -> Any:
     """A setting with ``_target_`` for the classes in it."""
     if inspect.isclass(value):
-        return {"_target_": target_of(value)}
+        return {"_target_": _name(value)}
     if isinstance(value, Mapping):
-        named = {
-            "_target_": target_of(v) for k, v in value.items() if k == "_target_" and callable(v)
-        }
-        return {**{key: _plain(item) for key, item in value.items()}, **named}
+        return {k: _name(v) if k == "_target_" else _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def _name(target: Any) -> Any:
+    """The ``_target_`` of a class or function; a name as it is."""
+    return target_of(target) if callable(target) else target
 
 
 def _expect(given: Any, kind: type) -> None:

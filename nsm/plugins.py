@@ -12,7 +12,7 @@ VARIABLE = "NSM_PLUGINS"
 
 
 def import_here() -> None:
-    """Let modules in the current folder be imported, after all others: ``_target_`` may name them."""
+    """Let ``_target_`` name modules in the current folder; all others take precedence."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
 
