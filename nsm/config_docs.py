@@ -80,8 +80,7 @@ def option_settings(group: str, name: str, run: Mapping[str, Any] | None = None)
     """
     text = (conf_folder() / group / f"{name}.yaml").read_text(encoding="utf-8")
     package = _PACKAGE.match(text)
-    node = OmegaConf.to_container(OmegaConf.create(text))
-    assert isinstance(node, dict)
+    node: Any = OmegaConf.to_container(OmegaConf.create(text))
     node.pop("defaults", None)
     if package:  # settings of other groups: those of the file alone
         return [_setting(key, value) for key, value in _leaves(node) if key != "hydra.mode"]
