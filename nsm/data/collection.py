@@ -41,7 +41,7 @@ class CollectionData(pl.LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.surfaces, self.rotations, self.sampler = surfaces, rotations, sampler or Sampler(0.0)
+        self.surfaces, self.rotations, self.sampler = surfaces, rotations, sampler or Sampler()
         self.share = max(1, batch_size // len(surfaces))
         self.held_share = max(1, held_out // len(surfaces))
         self.steps_per_epoch, self.seed = steps_per_epoch, seed

@@ -33,7 +33,7 @@ class Sampler:
     """
 
     def __init__(
-        self, vertex_share: float = 0.1, domain_share: float = 0.0, pool: int | None = None
+        self, vertex_share: float = 0.0, domain_share: float = 0.0, pool: int | None = None
     ) -> None:
         for name, share in (("vertex_share", vertex_share), ("domain_share", domain_share)):
             if not 0 <= share <= 1:

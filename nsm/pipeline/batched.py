@@ -16,7 +16,6 @@ import numpy as np
 import pytorch_lightning as pl
 from rich.console import Console
 
-from nsm.config import register_resolvers
 from nsm.data import EnsembleData, SurfaceData
 from nsm.errors import NsmError
 from nsm.instantiation import made, target_of
@@ -27,6 +26,7 @@ from nsm.pipeline.overfit import OverfitTask
 from nsm.pipeline.runner import built, finish, make_task
 from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_run, run_job
 from nsm.pipeline.training import Run, plain, trained
+from nsm.plugins import import_here
 from nsm.results.callbacks import Pictures
 from nsm.results.loggers import WandB
 from nsm.domains import Surface
@@ -189,7 +189,7 @@ def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
     """
     started = time.monotonic()
     os.chdir(calls[0][2])
-    register_resolvers()
+    import_here()
     console = Console(highlight=False, markup=False)
     surfaces: dict[str, Surface] = {}
     stages: dict[Any, list[_Job]] = {}

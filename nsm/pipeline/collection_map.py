@@ -10,8 +10,9 @@ import numpy as np
 import pytorch_lightning as pl
 import torch
 
-from nsm.data import CollectionData
+from nsm.data import CollectionData, SurfaceData
 from nsm.errors import NsmError
+from nsm.instantiation import named_object, target_of
 from nsm.pipeline.resolve_inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
@@ -133,6 +134,13 @@ class CollectionMapTask(Task):
     def build_data(self) -> pl.LightningDataModule:
         surfaces = [phi.surface for phi in self.phis]
         return self.made_data(surfaces=surfaces, rotations=self.rotations)
+
+    @property
+    def data_settings(self) -> dict[str, Any]:
+        """Those of the group ``data``; the options for one surface serve several as well."""
+        settings = super().data_settings
+        one_surface = named_object(settings["_target_"]) is SurfaceData
+        return {**settings, "_target_": target_of(CollectionData)} if one_surface else settings
 
     def make_result(self, module: Any) -> SurfaceCollection:
         maps = [frozen(h) for h in module.map]

@@ -11,11 +11,12 @@ from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 
-from nsm.config import checked, register_resolvers
+from nsm.config import checked
 from nsm.errors import NsmError
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.runner import run_task
 from nsm.pipeline.training import CONFIG_FILE, Run
+from nsm.plugins import import_here
 from nsm.sweeps import is_complete
 
 Result = TypeVar("Result")
@@ -38,7 +39,7 @@ def run_job(settings: dict[str, Any], folder: str, cwd: str, *, log: bool) -> st
         Why the job failed, in one line, or None.
     """
     os.chdir(cwd)
-    register_resolvers()
+    import_here()
     place = Path(folder)
 
     def work() -> None:

@@ -138,6 +138,11 @@ class Task:
             "domain": self.domain,
         }
 
+    @property
+    def data_settings(self) -> dict[str, Any]:
+        """The settings of the group ``data``."""
+        return dict(self.settings["data"])
+
     def build_data(self) -> pl.LightningDataModule:
         """The samples of the training."""
         return self.made_data(surface=self.surface)
@@ -146,7 +151,7 @@ class Task:
         """The configured DataModule, with inputs, sampler and seed."""
         sampler = made(self.config.sampler)
         data: pl.LightningDataModule = made_with(
-            self.settings["data"], **inputs, sampler=sampler, seed=self.config.seed
+            self.data_settings, **inputs, sampler=sampler, seed=self.config.seed
         )
         return data
 
