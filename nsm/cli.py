@@ -121,12 +121,19 @@ def _run_tasks(arguments: list[str]) -> int:
     import_plugins()
     OUTCOMES.clear()
 
+    failures: list[Exception] = []
+
     @hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
     def job(config: DictConfig) -> None:
-        _run(config)
+        try:
+            _run(config)
+        except Exception as error:  # Hydra would print a line of its own about it
+            failures.append(error)
 
     with _process_of_hydra(arguments):
         job()
+    if failures:
+        raise failures[0]
     return _sum_up() if OUTCOMES else 0
 
 
@@ -187,7 +194,9 @@ def _sum_up() -> int:
 
 def _answer(error: Exception) -> int:
     """Print an exception in one line; give the exit status."""
-    if isinstance(error, (HydraException, OmegaConfBaseException)):
+    raised = traceback.extract_tb(error.__traceback__)[-1].filename
+    of_hydra = isinstance(error, ValueError) and raised.startswith(str(Path(hydra.__file__).parent))
+    if of_hydra or isinstance(error, (HydraException, OmegaConfBaseException)):
         error = setting_error(error)
     elif isinstance(error, MemoryError):
         error = NsmError("not enough memory; give a smaller mesh, network or data.batch_size")
@@ -211,7 +220,8 @@ def _place(error: BaseException) -> str:
     Of an exception that passed through none, the last line of nsm's, unless it is an answer to
     bad input.
     """
-    ours = [str(Path(__file__).parent), str(Path(sys.modules["hydra_plugins"].__path__[0]))]
+    package = Path(__file__).parent
+    ours = (str(package), str(package.parent / "hydra_plugins"))
     libraries = [sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib")]
     chain, own = [], ""
     link: BaseException | None = error
@@ -219,7 +229,7 @@ def _place(error: BaseException) -> str:
         chain.append(link)
         for frame in traceback.extract_tb(link.__traceback__):
             place = f"{frame.filename}:{frame.lineno}"
-            if frame.filename.startswith(tuple(ours)):
+            if frame.filename.startswith(ours):
                 own = place
             elif not frame.filename.startswith((*libraries, "<", sys.prefix)):
                 return place

@@ -67,7 +67,6 @@ def register() -> None:
     for value in node.values():
         if isinstance(value, DictConfig):
             OmegaConf.set_struct(value, False)
-    node.update(energy=None, constraints=None)
     ConfigStore.instance().store(name="nsm_settings", node=node, provider="nsm")
     OmegaConf.register_new_resolver("nsm.run_folder", _run_folder, replace=True, use_cache=True)
     OmegaConf.register_new_resolver("nsm.sweep_folder", _sweep_folder, replace=True)
@@ -139,7 +138,7 @@ def composed(overrides: Sequence[str] = ()) -> tuple[DictConfig, dict[str, str |
     try:
         with _own_hydra(), initialize_config_dir(str(conf_folder()), version_base="1.3"):
             config = compose("config", overrides=prepared, return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise setting_error(error) from error
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):

@@ -94,7 +94,7 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
     task = named_object(result["task"]["_target_"])
     result["task"]["name"] = result["task"]["name"] or task.__name__.lower()
     module = getattr(task, "module", None)
-    for key, name in (("loss_weights", "Weights"), ("constraints", "Constraints")):
+    for key, name in (("constraints", "Constraints"), ("loss_weights", "Weights")):
         result[key] = _of_task(key, settings.get(key), getattr(module, name, None), result)
     _build(result)
     if result["phi"]["overrides"]:
@@ -110,7 +110,9 @@ def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, 
     settings = _mapping(key, node or {})
     name = settings.get("_target_")
     if not isinstance(name, str):
-        hint = f"choose {group}=OPTION, or give {key}._target_=MODULE.CLASS"
+        hint = f"give {key}._target_=MODULE.CLASS"
+        if key == group:
+            hint = f"choose {group}=OPTION, or {hint}"
         raise NsmError(f"setting {key}: missing; {hint}", kind="missing_setting", key=key)
     known, others = takes(group, _imported(f"{key}._target_", name))
     retargeted = f"{key}._target_" in given or f"{group}._target_" in given

@@ -56,9 +56,9 @@ def fit(value: Any, kind: Any) -> Any:
         value = fit(value, inside[0])
         limits = inside[1]
         if value is not None and not limits.least <= value <= limits.largest:
-            bounds = f"at least {limits.least:g}"
+            bounds = f"at least {limits.least}"
             if limits.largest < float("inf"):
-                bounds += f" and at most {limits.largest:g}"
+                bounds += f" and at most {limits.largest}"
             raise Misfit(f"{value} must be {bounds}", "out_of_range")
         return value
     if origin in (Union, types.UnionType):
@@ -108,17 +108,19 @@ _PLAIN = {
 
 
 def described(kind: Any) -> str:
-    """A type as users know it."""
+    """A type as users know it, without the classes that YAML cannot write down."""
+    none = type(None)
     origin, inside = typing.get_origin(kind), typing.get_args(kind)
     if origin is Annotated:
         return described(inside[0])
     if origin in (Union, types.UnionType):
-        return " or ".join(dict.fromkeys(described(one) for one in inside))
+        known = [one for one in inside if not inspect.isclass(one) or one in _PLAIN or one is none]
+        return " or ".join(dict.fromkeys(described(one) for one in known or inside))
     if origin is Literal:
         return f"one of {', '.join(map(str, inside))}"
     if origin in (list, tuple, Sequence):
         return f"a list, each item {described(inside[0])}" if inside else "a list"
-    if kind is type(None):
+    if kind is none:
         return "null"
     return _PLAIN.get(origin or kind, getattr(kind, "__name__", str(kind)))
 
