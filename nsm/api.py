@@ -227,7 +227,7 @@ class _Request:
             if (conf_folder() / "domain" / f"{domain}.yaml").is_file():
                 chosen.append(f"domain={domain}")
             else:
-                merged["domain"] = {"_target_": target_of(type(ready[0].domain))}
+                merged["domain"] = ready[0].domain.config
         self.overrides, self.settings = [f"task={task}", *overrides, *chosen], merged
 
     def _check(self, key: str, ready: Sequence[Surface]) -> None:

@@ -6,6 +6,7 @@ what an option's ``_target_`` names, and from :mod:`nsm.settings`.
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,10 +16,10 @@ from typing import Any
 
 import docstring_parser
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from nsm import settings as plain
-from nsm.config import COLLECTIONS, conf_folder
+from nsm.config import COLLECTIONS, composed, conf_folder
 
 _PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
 _DEFAULT = re.compile(r"  - (?:override )?([^\s:]+): (\S+)$")
@@ -83,7 +84,7 @@ def option_settings(group: str, name: str, run: Mapping[str, Any] | None = None)
     node: Any = OmegaConf.to_container(OmegaConf.create(text))
     node.pop("defaults", None)
     if package:  # settings of other groups: those of the file alone
-        return [_setting(key, value) for key, value in _leaves(node) if key != "hydra.mode"]
+        return [_setting(k, v) for k, v in _leaves(node) if k not in ("hydra.mode", "task.name")]
     key = group.replace("/", ".")
     if run is not None and not group.startswith("hydra/"):
         node = run.get(key) or node
@@ -111,6 +112,7 @@ def target_settings(key: str, group: str, node: Mapping[str, Any]) -> list[Setti
 
 def plain_settings(run: Mapping[str, Any]) -> list[Setting]:
     """The settings outside the groups, with their values in a configuration."""
+    run = OmegaConf.to_container(run) if isinstance(run, DictConfig) else run  # type: ignore[assignment]
     nested = {key: run[key] for key in plain.parts()}
     others = {key: run[key] for key in plain.parameters(plain.Settings)[0] if key not in nested}
     return [_setting(key, value) for key, value in _leaves({**nested, **others})]
@@ -119,11 +121,22 @@ def plain_settings(run: Mapping[str, Any]) -> list[Setting]:
 def known_keys() -> list[str]:
     """Names of all groups and plain settings, dotted."""
     keys = {group.name.replace("/", ".") for group in groups()}
-    return sorted(keys | set(_plain_remarks()))
+    return sorted(keys | set(plain.parts()) | set(_plain_remarks()))
 
 
 def _setting(key: str, value: Any) -> Setting:
-    return Setting(key, _yaml(value), _plain_remarks().get(key, ""))
+    if key.startswith("hydra.sweeper.params."):
+        return Setting(key, _yaml(value), "the values of the sweep")
+    return Setting(key, _yaml(value), _plain_remarks().get(key) or _default_remarks(key))
+
+
+def _default_remarks(key: str) -> str:
+    """What the class of a group's default option says of one of its settings."""
+    from nsm.instantiation import named_object
+
+    group, _, name = key.partition(".")
+    node = composed()[0].get(group) or {}
+    return remarks(named_object(node["_target_"])).get(name, "") if "_target_" in node else ""
 
 
 @cache
@@ -158,10 +171,12 @@ def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _yaml(value: Any) -> str:
+    if value is inspect.Parameter.empty:
+        return "???"  # as Hydra writes what must be given
     if isinstance(value, tuple):
         value = list(value)
     try:
         text = yaml.safe_dump(value, default_flow_style=True, width=10**6, allow_unicode=True)
     except yaml.YAMLError:  # a default that only Python can write down
         return "..."
-    return "..." if value is plain.Parameter.default else text.removesuffix("...\n").strip()
+    return text.removesuffix("...\n").strip()

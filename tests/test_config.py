@@ -3,6 +3,7 @@
 import random
 import sys
 import types
+from importlib import import_module
 
 import hydra
 import numpy as np
@@ -87,7 +88,7 @@ def test_an_option_repeats_no_default():
         node = yaml.safe_load((conf_folder() / group / f"{name}.yaml").read_text()) or {}
         if node.get("_target_", "").startswith("nsm."):  # torch's may change
             module, _, kind = node["_target_"].rpartition(".")
-            known = parameters(getattr(sys.modules[module], kind))[0]
+            known = parameters(getattr(import_module(module), kind))[0]
             for key in set(node) & set(known):
                 default = known[key].default
                 assert node[key] != (list(default) if isinstance(default, tuple) else default)
