@@ -36,3 +36,24 @@ def extreme_metrics():
             for c in correlations
         ]
     )
+
+
+class Disc:
+    """The unit disc, as constraints and inverses see it."""
+
+    def signed_distance(self, points):
+        return torch.linalg.vector_norm(points, dim=-1) - 1
+
+    def project(self, points):
+        return points / torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp(min=1)
+
+
+class Square:
+    """The square [−1, 1]², as constraints and inverses see it."""
+
+    def signed_distance(self, points):
+        q = points.abs() - 1
+        return torch.linalg.vector_norm(q.clamp(min=0), dim=-1) + q.amax(dim=-1).clamp(max=0)
+
+    def project(self, points):
+        return points.clamp(-1, 1)

@@ -1,18 +1,6 @@
 """Energies: pure functions of Jacobians, metrics or points to one value per sample."""
 
-from nsm.energies.constraints import (
-    boundary,
-    boundary_disc,
-    boundary_square,
-    injectivity,
-    inside,
-    landmark,
-    outside,
-    outside_disc,
-    outside_square,
-    signed_distance,
-    unfold,
-)
+from nsm.energies.constraints import boundary, injectivity, inside, landmark, outside, unfold
 from nsm.energies.distortion import (
     arap,
     area,
@@ -24,29 +12,47 @@ from nsm.energies.distortion import (
     symmetric_arap,
     symmetric_dirichlet,
 )
-from nsm.energies.metrics import (
-    Invariants,
-    first_fundamental_form,
-    pullback_invariants,
-    singular_values,
-)
+from nsm.energies.metrics import Invariants, first_fundamental_form, pullback_invariants
 from nsm.energies.overfit import normal, position
 from nsm.energies.procrustes import rotation
-from nsm.energies.registry import ENERGIES, Blend, Energy, energy
+from nsm.energies.registry import (
+    ARAP,
+    ENERGIES,
+    MIPS,
+    Area,
+    At,
+    Blend,
+    Conformal,
+    Dirichlet,
+    Energy,
+    EquiarealConformal,
+    SingularValueRatio,
+    SymmetricARAP,
+    SymmetricDirichlet,
+    call_energy,
+)
 
 __all__ = [
+    "ARAP",
     "ENERGIES",
+    "MIPS",
+    "Area",
+    "At",
     "Blend",
+    "Conformal",
+    "Dirichlet",
     "Energy",
+    "EquiarealConformal",
     "Invariants",
-    "area",
+    "SingularValueRatio",
+    "SymmetricARAP",
+    "SymmetricDirichlet",
     "arap",
+    "area",
     "boundary",
-    "boundary_disc",
-    "boundary_square",
+    "call_energy",
     "conformal",
     "dirichlet",
-    "energy",
     "equiareal_conformal",
     "first_fundamental_form",
     "injectivity",
@@ -55,14 +61,10 @@ __all__ = [
     "mips",
     "normal",
     "outside",
-    "outside_disc",
-    "outside_square",
     "position",
     "pullback_invariants",
     "rotation",
-    "signed_distance",
     "singular_value_ratio",
-    "singular_values",
     "symmetric_arap",
     "symmetric_dirichlet",
     "unfold",

@@ -1,101 +1,66 @@
-"""Terms that hold a planar map h in place: the boundary of Ω, injectivity, landmarks.
+"""Terms that constrain a planar map h: the boundary of Ω, injectivity, landmarks.
 
 Points are (..., 2), values (...), in the type of the points; all are finite in value and
-gradient for finite points. Ω is the unit disc or the square [−1, 1]².
+gradient for finite points.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from nsm.energies.naming import look_up
 from nsm.energies.numerics import narrow, widen
 
 STEEPEST = 20.0  # the injectivity term grows as exp until det = −STEEPEST, then linearly
 
 
-def _disc(p: Tensor) -> Tensor:
-    # vector_norm, unlike a root of squares, has a gradient (zero) at the centre
-    return torch.linalg.vector_norm(p, dim=-1) - 1
+class Bounded(Protocol):
+    """A domain Ω of the plane."""
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Distance (...) of points (..., 2) to ∂Ω, negative inside."""
+        ...
 
 
-def _square(p: Tensor) -> Tensor:
-    q = p.abs() - 1
-    beyond = torch.linalg.vector_norm(q.clamp(min=0), dim=-1)
-    return beyond + q.amax(dim=-1).clamp(max=0)
-
-
-DOMAINS: dict[str, Callable[[Tensor], Tensor]] = {"disc": _disc, "square": _square}
-
-
-def _distance(domain: str, p: Tensor) -> Tensor:
+def _distance(domain: Bounded, p: Tensor) -> Tensor:
     if p.shape[-1:] != (2,):
         raise ValueError(f"points of the plane are (..., 2), not {tuple(p.shape)}")
-    return look_up(DOMAINS, domain, "domain")(widen(p))
+    return domain.signed_distance(widen(p))
 
 
-def signed_distance(domain: str, p: Tensor) -> Tensor:
-    """Euclidean distance of p (..., 2) to the boundary of Ω, negative inside.
-
-    Args:
-        domain: ``disc`` or ``square``.
-        p: (..., 2).
-
-    Raises:
-        ValueError: the domain is not known, or p is not (..., 2).
-    """
-    return narrow(_distance(domain, p), p.dtype)
-
-
-def inside(domain: str, p: Tensor, tolerance: float = 0.0) -> Tensor:
+def inside(domain: Bounded, p: Tensor, tolerance: float = 0.0) -> Tensor:
     """Mask (...) of the points of Ω, boundary included, widened by ``tolerance``.
 
+    Args:
+        domain: Ω.
+        p: (..., 2).
+        tolerance: a distance.
+
     Raises:
-        ValueError: as ``signed_distance``.
+        ValueError: p is not (..., 2).
     """
     return _distance(domain, p) <= tolerance
 
 
-def boundary(domain: str, p: Tensor) -> Tensor:
+def boundary(domain: Bounded, p: Tensor) -> Tensor:
     """Squared signed distance σ(p) to ∂Ω, METHOD (B): zero on ∂Ω, so that the image may slide.
 
     Raises:
-        ValueError: as ``signed_distance``.
+        ValueError: p is not (..., 2).
     """
     return narrow(_distance(domain, p) ** 2, p.dtype)
 
 
-def outside(domain: str, p: Tensor) -> Tensor:
+def outside(domain: Bounded, p: Tensor) -> Tensor:
     """Squared distance to Ω: zero inside, it pulls back samples that h sent out.
 
     Raises:
-        ValueError: as ``signed_distance``.
+        ValueError: p is not (..., 2).
     """
     return narrow(_distance(domain, p).clamp(min=0) ** 2, p.dtype)
-
-
-def boundary_disc(p: Tensor) -> Tensor:
-    """``boundary`` of the unit disc: (‖p‖ − 1)²."""
-    return boundary("disc", p)
-
-
-def boundary_square(p: Tensor) -> Tensor:
-    """``boundary`` of the square [−1, 1]²; points slide along sides, corners do not hold them."""
-    return boundary("square", p)
-
-
-def outside_disc(p: Tensor) -> Tensor:
-    """``outside`` of the unit disc: max(‖p‖ − 1, 0)²."""
-    return outside("disc", p)
-
-
-def outside_square(p: Tensor) -> Tensor:
-    """``outside`` of the square [−1, 1]²."""
-    return outside("square", p)
 
 
 def injectivity(det: Tensor) -> Tensor:
@@ -116,10 +81,9 @@ def injectivity(det: Tensor) -> Tensor:
 
 
 def unfold(det: Tensor, margin: float = 0.1) -> Tensor:
-    """((margin − det) / margin)² under the margin, zero above it; under zero along its tangent.
+    """((margin − det) / margin)² below the margin, zero above it; below zero along its tangent.
 
-    ``injectivity`` lets go of a triangle as soon as it is not flipped, and has no gradient until
-    it is; this one clears the way.
+    ``injectivity`` has a gradient only where a triangle is flipped; this term pushes it beyond.
 
     Args:
         det: (...), determinants of J_h, or signed areas of triangles relative to their own.

@@ -16,9 +16,8 @@ Values and gradients are finite for all finite metrics of float32 range:
 Maps with σ above 1e-2 and σ₁/σ₂ below 1e3, of source metrics above 1e-6, are altered by less
 than 1e-6 of their value.
 
-A metric does not know orientation: a map and its mirror image have one distortion. In the plane,
-where a fold is the sign of det J_h, keeping that sign is the work of
-:func:`nsm.energies.constraints.injectivity`.
+A metric carries no orientation: a map and its mirror image have the same distortion. In the plane,
+where a fold is a negative det J_h, :func:`nsm.energies.constraints.injectivity` keeps the sign.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nsm.energies.numerics import safe_sqrt, widen
+from nsm.energies.numerics import widen
 
 # Added to A's diagonal: a source metric this small is a collapsed surface (areas are about π),
 # and larger ones, from 1e-6 up, are altered by less than 1e-6 of themselves.
@@ -85,27 +85,3 @@ def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
 def _entries(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     m = widen(metric)
     return m[..., 0, 0], (m[..., 0, 1] + m[..., 1, 0]) / 2, m[..., 1, 1]
-
-
-def singular_values(trace: Tensor, determinant: Tensor) -> tuple[Tensor, Tensor]:
-    """σ₁ ≥ σ₂ ≥ 0 from t = σ₁² + σ₂² and d = σ₁²σ₂².
-
-    At σ₁ = σ₂ and at zero the singular values have no derivative; there the gradient is finite
-    (that of the mean of the two, and zero). d is taken as at most t²/4.
-
-    Args:
-        trace, determinant: t and d (...), not negative; float64, as ``Invariants`` holds them,
-            or σ₁ − σ₂ of a near-conformal map drowns in rounding.
-
-    Returns:
-        σ₁ and σ₂, each (...).
-    """
-    product = torch.minimum(safe_sqrt(determinant, 1e-60), trace / 2)
-    total = safe_sqrt(trace + 2 * product, 1e-60)
-    # at σ₁ = σ₂ the squared difference is rounding of the trace, and its root has no slope
-    gap = (trace - 2 * product) / torch.where(trace > 0, trace, 1.0)
-    difference = safe_sqrt(gap, 1e-15) * safe_sqrt(trace, 1e-60)
-    largest = (total + difference) / 2
-    # not (total − difference) / 2, which cancels where σ₂ is much the smaller
-    smallest = product / torch.where(largest > 0, largest, 1.0)
-    return largest, torch.minimum(smallest, largest)

@@ -1,85 +1,217 @@
-"""Distortion energies by name, with their parameters, alone or mixed."""
+"""Distortion energies as objects: callables of metrics, alone or in a weighted sum."""
 
 from __future__ import annotations
 
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Any
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
 from nsm.energies import distortion
 from nsm.energies.naming import look_up
 
-Energy = Callable[[Tensor, Tensor], Tensor]
 
-ENERGIES: dict[str, Callable[..., Tensor]] = {
-    "symmetric_dirichlet": distortion.symmetric_dirichlet,
-    "conformal": distortion.conformal,
-    "singular_value_ratio": distortion.singular_value_ratio,
-    "arap": distortion.arap,
-    "symmetric_arap": distortion.symmetric_arap,
-    "mips": distortion.mips,
-    "area": distortion.area,
-    "dirichlet": distortion.dirichlet,
-    "equiareal_conformal": distortion.equiareal_conformal,
+class At(NamedTuple):
+    """Where samples are; either may be unknown.
+
+    Attributes:
+        uv: (..., 2), in Ω.
+        position: (..., 3), on the source surface.
+    """
+
+    uv: Tensor | None = None
+    position: Tensor | None = None
+
+
+# of A and B (..., 2, 2) and, if it takes it, At, to (...)
+Energy = Callable[..., Tensor]
+
+
+@dataclass(frozen=True)
+class SymmetricDirichlet:
+    """METHOD, Eq. 2 (see :func:`nsm.energies.symmetric_dirichlet`).
+
+    Args:
+        epsilon: ε, not negative; bounds the cost of a collapse.
+
+    Raises:
+        ValueError: ε is negative.
+    """
+
+    epsilon: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not self.epsilon >= 0:
+            raise ValueError(f"energy.epsilon must not be negative: {self.epsilon}")
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.symmetric_dirichlet(source, target, self.epsilon)
+
+
+@dataclass(frozen=True)
+class Conformal:
+    """METHOD, Eq. 3 (see :func:`nsm.energies.conformal`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.conformal(source, target)
+
+
+@dataclass(frozen=True)
+class SingularValueRatio:
+    """σ₁/σ₂ (see :func:`nsm.energies.singular_value_ratio`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.singular_value_ratio(source, target)
+
+
+@dataclass(frozen=True)
+class ARAP:
+    """As rigid as possible (see :func:`nsm.energies.arap`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.arap(source, target)
+
+
+@dataclass(frozen=True)
+class SymmetricARAP:
+    """As rigid as possible, both ways (see :func:`nsm.energies.symmetric_arap`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.symmetric_arap(source, target)
+
+
+@dataclass(frozen=True)
+class MIPS:
+    """σ₁/σ₂ + σ₂/σ₁ (see :func:`nsm.energies.mips`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.mips(source, target)
+
+
+@dataclass(frozen=True)
+class Area:
+    """Change of area (see :func:`nsm.energies.area`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.area(source, target)
+
+
+@dataclass(frozen=True)
+class Dirichlet:
+    """(σ₁² + σ₂²)/2 (see :func:`nsm.energies.dirichlet`)."""
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.dirichlet(source, target)
+
+
+@dataclass(frozen=True)
+class EquiarealConformal:
+    """Angles and areas in one (see :func:`nsm.energies.equiareal_conformal`).
+
+    Args:
+        blend: in [0, 1]; angles alone at 0, areas alone at 1.
+
+    Raises:
+        ValueError: ``blend`` is out of range.
+    """
+
+    blend: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.blend <= 1:
+            raise ValueError(f"energy.blend is not in [0, 1]: {self.blend}")
+
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+        return distortion.equiareal_conformal(source, target, self.blend)
+
+
+ENERGIES: dict[str, Callable[..., Energy]] = {
+    "symmetric_dirichlet": SymmetricDirichlet,
+    "conformal": Conformal,
+    "singular_value_ratio": SingularValueRatio,
+    "arap": ARAP,
+    "symmetric_arap": SymmetricARAP,
+    "mips": MIPS,
+    "area": Area,
+    "dirichlet": Dirichlet,
+    "equiareal_conformal": EquiarealConformal,
 }
 
 
-def energy(name: str, **parameters: Any) -> Energy:
-    """The energy of that name, as a function of the metrics A and B (..., 2, 2) to (...).
+def _with_at(energy: Energy) -> Callable[[Tensor, Tensor, At | None], Tensor]:
+    """An energy as a function of three arguments; one that takes no ``at`` does not get it."""
+    try:
+        parameters = inspect.signature(energy).parameters
+    except ValueError:  # functions in C have no signature
+        parameters = inspect.Signature().parameters
+    if "at" in parameters:
+        return lambda source, target, at: energy(source, target, at=at)
+    needed = [p for p in parameters.values() if p.default is p.empty and p.kind <= 1]
+    if len(needed) == 3:
+        return lambda source, target, at: energy(source, target, at)
+    return lambda source, target, at: energy(source, target)
+
+
+def call_energy(energy: Energy, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
+    """An energy at samples, whether it takes ``at`` or the metrics alone.
 
     Args:
-        name: a key of ``ENERGIES``.
-        **parameters: its parameters (``epsilon`` of ``symmetric_dirichlet``, ``blend`` of
-            ``equiareal_conformal``); their values are checked when the energy is evaluated.
+        energy: of (source, target) or (source, target, at).
+        source, target: metrics A and B (..., 2, 2).
+        at: where the samples are.
 
-    Raises:
-        ValueError: the name (the message gives the nearest) or a parameter is not known.
+    Returns:
+        (...).
     """
-    function = look_up(ENERGIES, name, "energy")
-    known = {key: None for key in list(inspect.signature(function).parameters)[1:]}
-    for key in parameters:
-        if not known:
-            raise ValueError(f"energy {name!r} takes no parameters, and was given {key!r}")
-        look_up(known, key, f"parameter of energy {name!r}")
-    return partial(function, **parameters)
+    return _with_at(energy)(source, target, at)
 
 
 class Blend:
-    """Σ wᵢ·Eᵢ, with the energies' default parameters; as a function of the metrics A and B.
+    """Σ wᵢ·Eᵢ, as a function of the metrics A and B.
 
     Args:
         weights: name of an energy to its weight.
+        terms: name to energy, for those of the user's own or with parameters; the other names
+            are those of ``ENERGIES``, with default parameters.
 
     Attributes:
         weights: the same, as floats.
 
     Raises:
-        ValueError: there are no weights, a name is not known, or a weight is negative or not
-            finite.
+        ValueError: there are no weights, a name is not known, a term has no weight, or a weight is
+            negative or not finite.
     """
 
-    def __init__(self, weights: Mapping[str, float]) -> None:
+    def __init__(
+        self, weights: Mapping[str, float], terms: Mapping[str, Energy] | None = None
+    ) -> None:
+        terms = dict(terms or {})
         if not weights:
-            raise ValueError("a blend of energies needs at least one weight")
+            raise ValueError("energy.weights: a blend needs at least one weight")
+        for name in terms:
+            if name not in weights:
+                raise ValueError(f"energy.terms: {name!r} has no weight in energy.weights")
         for name, weight in weights.items():
             if not (math.isfinite(weight) and weight >= 0):
                 raise ValueError(f"weight of energy {name!r} is negative or not finite: {weight}")
         self.weights = {name: float(weight) for name, weight in weights.items()}
-        self._energies = {name: energy(name) for name in weights}
+        self._energies = {
+            name: _with_at(terms[name] if name in terms else look_up(ENERGIES, name, "energy")())
+            for name in weights
+        }
 
-    def parts(self, source: Tensor, target: Tensor) -> dict[str, Tensor]:
+    def parts(self, source: Tensor, target: Tensor, at: At | None = None) -> dict[str, Tensor]:
         """Each energy by name, without its weight: metrics A and B (..., 2, 2) to (...)."""
-        return {name: term(source, target) for name, term in self._energies.items()}
+        return {name: term(source, target, at) for name, term in self._energies.items()}
 
     def total(self, parts: Mapping[str, Tensor]) -> Tensor:
         """Σ wᵢ·Eᵢ of what ``parts`` gave."""
         first, *rest = (self.weights[name] * part for name, part in parts.items())
         return sum(rest, start=first)
 
-    def __call__(self, source: Tensor, target: Tensor) -> Tensor:
+    def __call__(self, source: Tensor, target: Tensor, at: At | None = None) -> Tensor:
         """Σ wᵢ·Eᵢ: metrics A and B (..., 2, 2) to (...)."""
-        return self.total(self.parts(source, target))
+        return self.total(self.parts(source, target, at))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.maps.composition import PointMap, Rotated
-from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
+from nsm.maps.encodings import SplineGrid, transformed, value_and_jacobian_stack
 from nsm.maps.mlp_with_tangents import MLPWithTangents
 from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
 from nsm.maps.planar import IdentityInitializedMap
@@ -36,6 +36,8 @@ class Alike(nn.Module):
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(k, N, 2) to the values (k, N, out_dim) and Jacobians (k, N, out_dim, 2)."""
         networks = cast(Sequence[NeuralMap], self.networks)
+        if transformed():
+            return OneByOne(networks).value_and_jacobian(x)
         parameters = zip(
             *([p for m in n.layers for p in (m.weight, m.bias)] for n in networks), strict=True
         )
@@ -109,7 +111,7 @@ def batched(maps: Sequence[nn.Module]) -> Any:
         if isinstance(first, IdentityInitializedMap):
             networks = [cast(IdentityInitializedMap, m).network for m in maps]
             return type(first).around(batched(networks))
-        if isinstance(first, NeuralMap) and first.config["block"] in SKIPS:
+        if isinstance(first, NeuralMap) and first.fused:
             alike = cast(Sequence[NeuralMap], maps)
             if all(m.config == first.config for m in alike):
                 return Alike(alike)

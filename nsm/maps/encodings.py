@@ -1,4 +1,4 @@
-"""Encodings of the plane: what a network sees instead of the bare (u, v)."""
+"""Encodings of the plane: the features of a point (u, v) that a network takes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from nsm.instantiation import target_of
+
 
 class Encoding(Protocol):
-    """What stands before a network: a module from points x (N, 2) to features (N, out_dim).
+    """A module from points x (N, 2) to features (N, out_dim).
 
-    One that has no ``value_and_jacobian_stack`` is differentiated by :func:`pushed_forward`.
+    One without ``value_and_jacobian_stack`` is differentiated by :func:`pushed_forward`.
     """
 
     out_dim: int
+    config: dict[str, Any]
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Points (N, 2) to (N, out_dim), each row of its own point alone."""
+        """Points (N, 2) to (N, out_dim); each row depends on its own point alone."""
         ...
 
 
@@ -28,7 +31,7 @@ def pushed_forward(function: Callable[[Tensor], Tensor], stack: Tensor) -> Tenso
     """A function of the rows of a tensor, with its tangents, by PyTorch's forward mode.
 
     Args:
-        function: (N, d) to (N, d'), each row of its own row alone.
+        function: (N, d) to (N, d'); each row depends on its own row alone.
         stack: value and both tangents of its argument, (3, N, d).
 
     Returns:
@@ -36,6 +39,33 @@ def pushed_forward(function: Callable[[Tensor], Tensor], stack: Tensor) -> Tenso
     """
     by_u, by_v = (torch.func.jvp(function, (stack[0],), (tangent,)) for tangent in stack[1:])
     return torch.stack([by_u[0], by_u[1], by_v[1]])
+
+
+def transformed() -> bool:
+    """Whether a transform of torch.func is active.
+
+    The operations with a backward pass of their own then give way to plain ones, which all
+    transforms know.
+    """
+    return not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active()
+
+
+def as_encoding(given: Any, config: dict[str, Any] | None = None) -> Encoding:
+    """A module as an encoding with ``config``.
+
+    Args:
+        given: a module from points (N, 2) to features (N, ``out_dim``).
+        config: settings with ``_target_`` from which it is made again; by default its own.
+
+    Raises:
+        ValueError: it has no ``out_dim``.
+    """
+    if not isinstance(getattr(given, "out_dim", None), int):
+        raise ValueError("encoding: it needs out_dim, its number of features")
+    if not hasattr(given, "config"):
+        given.config = dict(config or {"_target_": target_of(type(given))})
+    encoding: Encoding = given
+    return encoding
 
 
 def value_and_jacobian_stack(encoding: Encoding, x: Tensor) -> Tensor:
@@ -46,12 +76,22 @@ def value_and_jacobian_stack(encoding: Encoding, x: Tensor) -> Tensor:
     return pushed_forward(encoding, Identity(x.shape[1]).value_and_jacobian_stack(x))
 
 
-class Identity(nn.Module):
-    """No encoding: the coordinates themselves."""
+def _config(encoding: nn.Module, in_dim: int, **parameters: Any) -> dict[str, Any]:
+    of_input = {} if in_dim == 2 else {"in_dim": in_dim}
+    return {"_target_": target_of(type(encoding)), **of_input, **parameters}
 
-    def __init__(self, in_dim: int) -> None:
+
+class Identity(nn.Module):
+    """No encoding: the coordinates themselves.
+
+    Args:
+        in_dim: dimension of x.
+    """
+
+    def __init__(self, in_dim: int = 2) -> None:
         super().__init__()
         self.out_dim = in_dim
+        self.config = _config(self, in_dim)
 
     def forward(self, x: Tensor) -> Tensor:
         return x
@@ -68,11 +108,17 @@ class RandomFourierFeatures(nn.Module):
     Args:
         in_dim: dimension of x.
         features: rows of B; ``out_dim`` is ``in_dim + 2 * features``.
-        sigma: standard deviation of B's entries, in cycles per unit of the domain.
+        sigma: standard deviation of B's entries, in cycles per unit of Ω.
+
+    Raises:
+        ValueError: there are no features, or sigma is not positive.
     """
 
-    def __init__(self, in_dim: int, features: int = 64, sigma: float = 2.0) -> None:
+    def __init__(self, in_dim: int = 2, features: int = 64, sigma: float = 2.0) -> None:
         super().__init__()
+        if features < 1 or not 0 < sigma < math.inf:
+            raise ValueError("encoding.features and encoding.sigma must be positive")
+        self.config = _config(self, in_dim, features=features, sigma=sigma)
         self.register_buffer("frequencies", 2 * math.pi * sigma * torch.randn(features, in_dim))
         self.out_dim = in_dim + 2 * features
 
@@ -194,21 +240,24 @@ class SplineGrid(nn.Module):
     """Multi-resolution grids of trainable features, blended by uniform B-splines.
 
     Dense grids over [-extent, extent]², one per resolution, in the manner of multi-resolution
-    hash encodings (Müller et al., SIGGRAPH 2022); the plane is small enough that no hashing is
-    needed, and B-splines in place of linear interpolation make the map C¹ (degree 2) or C²
-    (degree 3), which the distortion energies of composed maps differentiate.
+    hash encodings (Müller et al., SIGGRAPH 2022). The plane is small enough to need no hashing.
+    B-splines in place of linear interpolation make the map C¹ (degree 2) or C² (degree 3), which
+    the distortion energies of composed maps differentiate.
 
     Args:
-        in_dim: 2; grids of other dimension are not offered.
+        in_dim: 2, the only dimension that there is.
         resolutions: cells a side, one number per level.
         features: features per level; ``out_dim`` is ``2 + len(resolutions) * features``.
         degree: 2 or 3.
-        extent: half the side of the square that is covered; x outside is clamped to its rim.
+        extent: half the side of the square that the grid covers; x outside is clamped to it.
+
+    Raises:
+        ValueError: a parameter is out of range.
     """
 
     def __init__(
         self,
-        in_dim: int,
+        in_dim: int = 2,
         resolutions: Sequence[int] = (8, 16, 32, 64, 128),
         features: int = 4,
         degree: int = 2,
@@ -216,12 +265,20 @@ class SplineGrid(nn.Module):
     ) -> None:
         super().__init__()
         if in_dim != 2 or degree not in (2, 3):
-            raise ValueError("the spline grid takes points of the plane and degree 2 or 3")
+            raise ValueError("encoding.degree must be 2 or 3, and encoding.in_dim 2")
         if not resolutions or min(resolutions) < 1:
             raise ValueError("encoding.resolutions needs one level or more, of 1 cell or more each")
         if features < 1 or extent <= 0:
             raise ValueError("encoding.features and encoding.extent must be positive")
         self.resolutions = [int(r) for r in resolutions]
+        self.config = _config(
+            self,
+            in_dim,
+            resolutions=self.resolutions,
+            features=features,
+            degree=degree,
+            extent=float(extent),
+        )
         self.degree, self.extent, self.features = degree, float(extent), features
         self.sides = [r + degree for r in self.resolutions]  # of the tables
         self.tables = nn.ParameterList(
@@ -268,14 +325,22 @@ class SplineGrid(nn.Module):
 
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""
+        if transformed():
+            return pushed_forward(self, Identity(2).value_and_jacobian_stack(x))
         with torch.no_grad():
             rows, orders = self._seen(x)
         return self._blended(x, rows, orders, list(self.tables))
 
     @classmethod
     def batched_stacks(cls, grids: Sequence[SplineGrid], x: Tensor) -> Tensor:
-        """What k grids, alike but for their features, have of k sets of points (k, N, 2) each:
-        values and both tangents, stacked: (k, 3, N, out_dim)."""
+        """Values and both tangents of k grids of one configuration, each at points of its own.
+
+        Args:
+            x: (k, N, 2).
+
+        Returns:
+            (k, 3, N, out_dim).
+        """
         first, points = grids[0], x.flatten(0, 1)
         with torch.no_grad():
             rows, orders = first._seen(points)
@@ -308,10 +373,3 @@ class SplineGrid(nn.Module):
             seen = table.index_select(0, row.flatten()).view(*row.shape, self.features)
             parts.append((weight[:, :, None] * seen).sum(dim=0))
         return torch.cat(parts, dim=-1)
-
-
-ENCODINGS: dict[str, Callable[..., Encoding]] = {
-    "identity": Identity,
-    "fourier": RandomFourierFeatures,
-    "spline_grid": SplineGrid,
-}

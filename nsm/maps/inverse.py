@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +16,12 @@ _STARTS, _ENOUGH = 12, 1e-9
 
 
 @torch.no_grad()
-def inverted(h: nn.Module, targets: Tensor, start: Tensor, onto: str | None = None) -> Tensor:
+def inverted(
+    h: nn.Module,
+    targets: Tensor,
+    start: Tensor,
+    project: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
     """Points x (N, 2) with h(x) = targets (N, 2), by damped Newton steps from start (N, 2).
 
     A step that would not come nearer is halved; where none helps, the point stays as it is, so
@@ -24,8 +30,8 @@ def inverted(h: nn.Module, targets: Tensor, start: Tensor, onto: str | None = No
     Args:
         h: a planar map with ``value_and_jacobian``, injective near the points.
         targets, start: (N, 2); float64 for the last digits, where h is of that type.
-        onto: ``disc`` or ``square``, which no x may leave: outside, h is whatever its network
-            makes of it.
+        project: from points (N, 2) to the nearest ones of Ω, which no x may leave; outside, h
+            extrapolates.
     """
     x = start.clone()
     moving = torch.arange(len(x), device=x.device)
@@ -42,7 +48,9 @@ def inverted(h: nn.Module, targets: Tensor, start: Tensor, onto: str | None = No
             if len(left) == 0:
                 break
             index = moving[left]
-            trial = _kept(x[index] + step[left], onto)
+            trial = x[index] + step[left]
+            if project is not None:
+                trial = project(trial)
             now = (targets[index] - h(trial)).norm(dim=1) < distance[left]
             x[index[now]] = trial[now]
             moved[left[now]] = True
@@ -54,10 +62,34 @@ def inverted(h: nn.Module, targets: Tensor, start: Tensor, onto: str | None = No
     return x
 
 
-def _kept(x: Tensor, onto: str | None) -> Tensor:
-    if onto == "disc":
-        return x / torch.linalg.vector_norm(x, dim=1, keepdim=True).clamp(min=1)
-    return x.clamp(-1, 1) if onto == "square" else x
+class _Inverse(torch.autograd.Function):
+    """x ↦ h_i⁻¹(x) of a :class:`TransitionMap`, differentiated by the inverse function theorem."""
+
+    @staticmethod
+    def forward(x: Tensor, transition: TransitionMap) -> Tensor:
+        return transition.back(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, TransitionMap], output: Tensor) -> None:
+        ctx.transition = inputs[1]
+        ctx.save_for_backward(output)
+        ctx.save_for_forward(output)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        jacobian = ctx.transition.first.value_and_jacobian(ctx.saved_tensors[0])[1]
+        return torch.linalg.solve(jacobian.mT, gradients[0]), None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
+        jacobian = ctx.transition.first.value_and_jacobian(ctx.saved_tensors[0])[1]
+        return torch.linalg.solve(jacobian, tangents[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, x: Tensor, transition: TransitionMap) -> tuple[Tensor, int]:
+        points = x.movedim(in_dims[0], 0)
+        flat: Tensor = _Inverse.apply(points.reshape(-1, 2), transition)
+        return flat.view(points.shape), 0
 
 
 class TransitionMap(nn.Module):
@@ -67,21 +99,32 @@ class TransitionMap(nn.Module):
         first, second: h_i and h_j, from the common domain.
         nodes: (M, 2) points of the common domain; Newton's method starts from the few whose
             images under h_i are nearest, until one leads to the point.
-        onto: the domain that h_i keeps to, if any.
+        project: from points (N, 2) to the nearest ones of the common domain, if h_i keeps to it.
     """
 
     nodes: Tensor
 
     def __init__(
-        self, first: nn.Module, second: nn.Module, nodes: Tensor, onto: str | None = None
+        self,
+        first: nn.Module,
+        second: nn.Module,
+        nodes: Tensor,
+        project: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__()
-        self.first, self.second, self.onto = first, second, onto
+        self.first, self.second, self.project = first, second, project
         self.register_buffer("nodes", nodes, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
-        return self.second(self.back(x))
+        return self.second(_Inverse.apply(x, self))
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) to the values (N, 2) and Jacobians J_j·J_i⁻¹ (N, 2, 2)."""
+        y = _Inverse.apply(x, self)
+        inner = cast(PointMap, self.first).value_and_jacobian(y)[1]
+        value, outer = cast(PointMap, self.second).value_and_jacobian(y)
+        return value, torch.linalg.solve(inner, outer, left=False)
 
     @torch.no_grad()
     def back(self, x: Tensor) -> Tensor:
@@ -93,13 +136,13 @@ class TransitionMap(nn.Module):
                 for part in x.split(2048)
             ]
         )
-        result = inverted(self.first, x, self.nodes[near[:, 0]], self.onto)
+        result = inverted(self.first, x, self.nodes[near[:, 0]], self.project)
         off = (self.first(result) - x).norm(dim=1)
         for k in range(1, near.shape[1]):
             missed = (off > _ENOUGH).nonzero()[:, 0]
             if len(missed) == 0:
                 break
-            other = inverted(self.first, x[missed], self.nodes[near[missed, k]], self.onto)
+            other = inverted(self.first, x[missed], self.nodes[near[missed, k]], self.project)
             distance = (self.first(other) - x[missed]).norm(dim=1)
             better = distance < off[missed]
             result[missed[better]], off[missed[better]] = other[better], distance[better]

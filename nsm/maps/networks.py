@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from nsm.maps.activations import Activation
+from nsm.errors import NsmError
+from nsm.instantiation import check_trusted, made, made_with
+from nsm.maps.activations import Activation, Softplus, as_activation
 from nsm.maps.encodings import (
-    ENCODINGS,
-    Encoding,
+    Identity,
+    as_encoding,
     pushed_forward,
+    transformed,
     value_and_jacobian_stack,
 )
 from nsm.maps.mlp_with_tangents import MLPWithTangents
@@ -60,8 +64,8 @@ BLOCKS: dict[str, Callable[[int, Activation], nn.Module]] = {
     "post": PostActivationBlock,
     "pre": PreActivationBlock,
 }
-# what every second layer adds (see :class:`nsm.maps.mlp_with_tangents.MLPWithTangents`); other
-# blocks have no written-out backward pass
+# what every second layer adds (see :class:`nsm.maps.mlp_with_tangents.MLPWithTangents`), of the
+# blocks whose layers that operation knows
 SKIPS = {"plain": None, "post": "post", "pre": "pre"}
 INITIALIZATIONS = ("xavier", "kaiming", "siren")
 # what the features of a point add to the output past the network: nothing, or a linear function;
@@ -75,13 +79,21 @@ class NeuralMap(nn.Module):
     Args:
         out_dim: 3 for a surface φ, 2 for a planar map h.
         width, depth: features of the hidden layers; number of blocks.
-        block: ``plain`` (one layer each), ``post`` (published residual), ``pre``, or one that was
-            registered.
-        activation: ``{"name": ..., parameters}``; see :mod:`nsm.maps.activations`.
-        encoding: ``{"name": ..., parameters}``; see :mod:`nsm.maps.encodings`.
+        block: ``plain`` (one layer each), ``post`` (published residual), ``pre``, or a registered
+            one.
+        activation: a module or function (see :func:`nsm.maps.activations.as_activation`);
+            softplus by default.
+        encoding: a module with ``out_dim`` (see :mod:`nsm.maps.encodings`); none by default.
         initialization: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
         linear_skip: ``none``; ``linear``: a linear function of the encoding's features, zero at the
             start, is added to the output; ``fitted``: the same, for a task that fits it.
+
+    Attributes:
+        config: settings with ``_target_`` from which :func:`build_stored` makes the network again.
+        fused: whether one operation with a backward pass of its own evaluates all layers.
+
+    Raises:
+        ValueError: a parameter is out of range.
     """
 
     def __init__(
@@ -90,37 +102,36 @@ class NeuralMap(nn.Module):
         width: int = 256,
         depth: int = 10,
         block: str = "pre",
-        activation: dict[str, Any] | None = None,
-        encoding: dict[str, Any] | None = None,
+        activation: Callable[[Tensor], Tensor] | None = None,
+        encoding: nn.Module | None = None,
         initialization: str = "kaiming",
         linear_skip: str = "none",
     ) -> None:
         super().__init__()
-        activation = dict(activation or {"name": "softplus"})
-        encoding = dict(encoding or {"name": "identity"})
+        for name, value, known in (
+            ("block", block, BLOCKS),
+            ("initialization", initialization, INITIALIZATIONS),
+            ("linear_skip", linear_skip, LINEAR_SKIPS),
+        ):
+            if value not in known:
+                raise ValueError(f"map.{name} {value!r} is not one of {', '.join(known)}")
+        if min(out_dim, width) < 1 or depth < 0:
+            raise ValueError("map.width must be positive, and map.depth not negative")
+        self.encoding = as_encoding(Identity() if encoding is None else encoding)
+        self.activation = as_activation(Softplus() if activation is None else activation)
         self.config: dict[str, Any] = {
+            "_target_": "nsm.maps.NeuralMap",
             "out_dim": out_dim,
             "width": width,
             "depth": depth,
             "block": block,
-            "activation": dict(activation),
-            "encoding": dict(encoding),
             "initialization": initialization,
             "linear_skip": linear_skip,
+            "activation": self.activation.config,
+            "encoding": self.encoding.config,
         }
-        if block not in BLOCKS:
-            raise ValueError(f"block {block!r} is not one of {', '.join(BLOCKS)}")
-        if initialization not in INITIALIZATIONS:
-            raise ValueError(
-                f"initialization {initialization!r} is not one of {', '.join(INITIALIZATIONS)}"
-            )
-        if linear_skip not in LINEAR_SKIPS:
-            raise ValueError(f"linear_skip {linear_skip!r} is not one of {', '.join(LINEAR_SKIPS)}")
-        name = encoding.pop("name")
-        if name not in ENCODINGS:
-            raise ValueError(f"encoding {name!r} is not one of {', '.join(ENCODINGS)}")
-        self.encoding: Encoding = ENCODINGS[name](2, **encoding)
-        self.activation = Activation(**activation)
+        # that operation gives the activation's own parameters no gradient
+        self.fused = block in SKIPS and next(self.activation.parameters(), None) is None
         self.input = nn.Linear(self.encoding.out_dim, width)
         self.blocks = nn.ModuleList(BLOCKS[block](width, self.activation) for _ in range(depth))
         self.output = nn.Linear(width, out_dim)
@@ -134,7 +145,7 @@ class NeuralMap(nn.Module):
         self._initialize(initialization)
 
     def _initialize(self, how: str) -> None:
-        omega = float(self.activation.parameters_.get("omega", 1.0))
+        omega = float(getattr(self.activation, "omega", 1.0))
         for module in self.layers:
             if how == "xavier":
                 nn.init.xavier_normal_(module.weight)
@@ -174,7 +185,7 @@ class NeuralMap(nn.Module):
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
         s = features = value_and_jacobian_stack(self.encoding, x)
-        if self.config["block"] in SKIPS:
+        if self.fused and not transformed():
             s = MLPWithTangents.apply(
                 s,
                 self.activation,
@@ -202,6 +213,90 @@ def add_linear_skip(stack: Tensor, features: Tensor, weight: Tensor, bias: Tenso
     return out
 
 
-def build_map(config: dict[str, Any]) -> NeuralMap:
-    """The network that a configuration (``NeuralMap.config``, or one from ``conf/map``) names."""
-    return NeuralMap(**config)
+class ForeignMap(nn.Module):
+    """A network without ``value_and_jacobian``, differentiated by PyTorch's forward mode.
+
+    Args:
+        network: (N, 2) to (N, n); each row depends on its own point alone.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, 2) to (N, n)."""
+        return self.network(x)
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) to the values (N, n) and Jacobians (N, n, 2)."""
+        stack = pushed_forward(self.network, Identity().value_and_jacobian_stack(x))
+        return stack[0], stack[1:].permute(1, 2, 0)
+
+
+def build_network(
+    map: Mapping[str, Any] | None = None,
+    activation: Mapping[str, Any] | None = None,
+    encoding: Mapping[str, Any] | None = None,
+    out_dim: int = 3,
+) -> nn.Module:
+    """The network that plain settings name, each part with the ``config`` it was made from.
+
+    Args:
+        map: with ``_target_``, :class:`NeuralMap` by default; a class of the user's gets
+            ``out_dim``, ``activation`` and ``encoding`` as far as its signature names them.
+        activation, encoding: with ``_target_``; those of :class:`NeuralMap` by default.
+        out_dim: 3 for a surface φ, 2 for a planar map h.
+
+    Returns:
+        A module with ``value_and_jacobian`` and ``config``.
+
+    Raises:
+        NsmError: a target cannot be imported or refuses its settings.
+    """
+    settings = {"_target_": "nsm.maps.NeuralMap", **(map or {})}
+    parts: dict[str, Any] = {}
+    with _refused("encoding", encoding):
+        if encoding is not None:
+            parts["encoding"] = as_encoding(made(encoding), dict(encoding))
+    with _refused("activation", activation):
+        if activation is not None:
+            parts["activation"] = as_activation(made(activation), dict(activation))
+    network: nn.Module = made_with(settings, out_dim=out_dim, **parts)
+    if not hasattr(network, "value_and_jacobian"):
+        network = ForeignMap(network)
+    if not hasattr(network, "config"):
+        configs = {key: part.config for key, part in parts.items()}
+        network.config = {**settings, "out_dim": out_dim, **configs}  # type: ignore[assignment]
+    return network
+
+
+def build_stored(config: Mapping[str, Any], trust: Iterable[str] = ()) -> nn.Module:
+    """The map that stored settings describe, perhaps a stranger's.
+
+    Args:
+        config: ``config`` of a map that :func:`build_network` made, or of a planar map around one.
+        trust: modules beside nsm and torch from which to make objects.
+
+    Raises:
+        NotTrusted: a target outside nsm, torch and these modules.
+        NsmError: a target cannot be imported or refuses its settings.
+    """
+    check_trusted(config, trust)
+    if isinstance(config.get("network"), Mapping):
+        around = {key: value for key, value in config.items() if key != "network"}
+        whole: nn.Module = made_with(around, network=build_stored(config["network"], trust))
+        return whole
+    parts = dict(config)
+    named = {k: parts.pop(k, None) for k in ("activation", "encoding")}
+    return build_network(parts, **named, out_dim=parts.pop("out_dim", 3))
+
+
+@contextmanager
+def _refused(group: str, settings: Mapping[str, Any] | None) -> Iterator[None]:
+    """ValueErrors of a part as errors of its settings."""
+    try:
+        yield
+    except ValueError as error:
+        target = (settings or {}).get("_target_")
+        raise NsmError(f"{target}: {error}", kind="not_instantiable", key=group) from error

@@ -2,48 +2,54 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-from nsm.maps.networks import NeuralMap
-
 
 class IdentityInitializedMap(nn.Module):
-    """A map made of a network whose output layer is zero at the start."""
+    """A map around a network whose output is zero at the start.
 
-    out_dim: int
-    onto: str | None = None  # the domain that the map keeps to by construction
+    Args:
+        network: (N, 2) to (N, ``network_out_dim``), with ``value_and_jacobian`` and ``config``. Its
+            output layer, ``output`` or else the last linear layer, is set to zero.
 
-    def __init__(self, **config: Any) -> None:
+    Attributes:
+        config: settings with ``_target_`` from which :func:`nsm.maps.build_stored` makes it again.
+
+    Raises:
+        ValueError: the network has no linear layer, or is not zero all the same.
+    """
+
+    network_out_dim: ClassVar[int] = 2
+
+    def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.network = NeuralMap(**{**config, "out_dim": self.out_dim})
-        nn.init.zeros_(self.network.output.weight)
-        nn.init.zeros_(self.network.output.bias)
+        self.network = network
+        linear = [m for m in network.modules() if isinstance(m, nn.Linear)]
+        last = getattr(network, "output", linear[-1] if linear else None)
+        if not isinstance(last, nn.Linear):
+            raise ValueError("map: its network needs a linear layer at its end")
+        nn.init.zeros_(last.weight)
+        if last.bias is not None:
+            nn.init.zeros_(last.bias)
 
     @classmethod
-    def around(cls, network: nn.Module) -> IdentityInitializedMap:
-        """The map of a network that is there, which also may be several in one batch."""
+    def around(cls, network: nn.Module) -> Self:
+        """The map of a network as it is, which also may be several in one batch."""
         made = cls.__new__(cls)
         nn.Module.__init__(made)
-        made.network = network  # type: ignore[assignment]
+        made.network = network
         return made
 
     @property
     def config(self) -> dict[str, Any]:
-        """What the map is built from (see :func:`build_planar`)."""
-        return {**self.network.config, "onto": self.onto}
+        return {"_target_": f"nsm.maps.{type(self).__name__}", "network": self.network.config}
 
 
 class PlanarMap(IdentityInitializedMap):
-    """h(x) = x + N(x), with a network N whose output layer is zero at the start.
-
-    Args:
-        **config: of the network (see :class:`nsm.maps.NeuralMap`); ``out_dim`` is 2.
-    """
-
-    out_dim = 2
+    """h(x) = x + N(x), unconstrained."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
@@ -61,11 +67,10 @@ class DiscMap(IdentityInitializedMap):
     The boundary constraint (METHOD, B) holds by construction, and the image of ∂Ω slides by θ.
 
     Args:
-        **config: of the network (N, θ); ``out_dim`` is 3.
+        network: (N, θ), with three outputs.
     """
 
-    out_dim = 3
-    onto = "disc"
+    network_out_dim = 3
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
@@ -90,14 +95,7 @@ class DiscMap(IdentityInitializedMap):
 
 
 class SquareMap(IdentityInitializedMap):
-    """h_i(x) = x_i + (1 − x_i²)·N_i(x): each side of the square goes to itself, corners stay.
-
-    Args:
-        **config: of the network N; ``out_dim`` is 2.
-    """
-
-    out_dim = 2
-    onto = "square"
+    """h_i(x) = x_i + (1 − x_i²)·N_i(x): each side of the square goes to itself, corners stay."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
@@ -108,27 +106,6 @@ class SquareMap(IdentityInitializedMap):
         out, jacobian = self.network.value_and_jacobian(x)
         room = 1 - x * x
         return x + room * out, torch.diag_embed(1 - 2 * x * out) + room[..., None] * jacobian
-
-
-Planar = PlanarMap | DiscMap | SquareMap
-_ONTO: dict[str | None, type[Planar]] = {None: PlanarMap, "disc": DiscMap, "square": SquareMap}
-
-
-def build_planar(config: dict[str, Any]) -> Planar:
-    """The planar map of a configuration (``config`` of any of these classes).
-
-    Args:
-        config: of the network, with ``onto``: the domain that the map keeps to by construction,
-            ``disc`` or ``square``; without it nothing holds the map.
-
-    Raises:
-        ValueError: ``onto`` is not a domain.
-    """
-    network = dict(config)
-    onto = network.pop("onto", None)
-    if onto not in _ONTO:
-        raise ValueError(f"onto {onto!r} is not a domain")
-    return _ONTO[onto](**network)
 
 
 def _turned(y: Tensor, c: Tensor, s: Tensor) -> Tensor:

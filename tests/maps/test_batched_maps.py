@@ -6,24 +6,25 @@ from typing import Any
 
 import pytest
 import torch
+from map_samples import activation, encoding, network, planar
 from torch import Tensor
 
-from nsm.maps import Composition, NeuralMap, Rotated, batched, build_analytic, build_planar
+from nsm.maps import Composition, Rotated, batched, build_analytic
 from nsm.maps.batched_maps import Alike, OneByOne
 
-GRID = {"name": "spline_grid", "resolutions": [4, 16], "features": 3}
+GRID = encoding("SplineGrid", resolutions=[4, 16], features=3)
 NETWORKS: list[dict[str, Any]] = [
-    {"depth": 2, "block": "plain", "encoding": GRID},
-    {"depth": 2, "block": "post", "encoding": {**GRID, "degree": 3}},
-    {"depth": 3, "block": "pre", "encoding": {"name": "fourier", "features": 8}},
-    {"depth": 2, "block": "post", "activation": {"name": "silu"}},
-    {"depth": 1, "block": "plain", "encoding": GRID, "linear_skip": "linear"},
+    {"depth": 2, "block": "plain", "enc": GRID},
+    {"depth": 2, "block": "post", "enc": {**GRID, "degree": 3}},
+    {"depth": 3, "block": "pre", "enc": encoding("RandomFourierFeatures", features=8)},
+    {"depth": 2, "block": "post", "act": activation("SiLU")},
+    {"depth": 1, "block": "plain", "enc": GRID, "linear_skip": "linear"},
 ]
 
 
-def several(network: dict[str, Any], count: int = 3) -> list[torch.nn.Module]:
+def several(settings: dict[str, Any], count: int = 3) -> list[torch.nn.Module]:
     torch.manual_seed(0)
-    maps = [NeuralMap(out_dim=3, width=16, **network).double() for _ in range(count)]
+    maps = [network(width=16, **settings) for _ in range(count)]
     for one in maps:  # no layer that is zero at the start
         for parameter in one.parameters():
             torch.nn.init.normal_(parameter, std=0.3)
@@ -57,9 +58,9 @@ def check(maps: list[Any], count: int = 37) -> None:
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("network", NETWORKS)
-def test_networks(network):
-    maps = several(network)
+@pytest.mark.parametrize("settings", NETWORKS)
+def test_networks(settings):
+    maps = several(settings)
     assert isinstance(batched(maps), Alike)
     check(maps)
 
@@ -73,7 +74,7 @@ def test_planar_maps_rotated_each_its_own_way(onto):
     torch.manual_seed(0)
     maps = []
     for angle in torch.tensor([0.0, 0.4, -2.0], dtype=torch.float64):
-        h = build_planar({"width": 8, "depth": 1, "encoding": GRID, "onto": onto}).double()
+        h = planar(onto, enc=GRID, width=8, depth=1)
         torch.nn.init.normal_(h.network.output.weight, std=0.1)
         c, s = angle.cos(), angle.sin()
         maps.append(Rotated(h, torch.stack([torch.stack([c, -s]), torch.stack([s, c])])))
@@ -96,12 +97,12 @@ def test_frozen_networks_pass_gradients_on_and_take_none():
 def test_maps_that_are_not_alike_are_evaluated_all_the_same():
     networks = several(NETWORKS[0], 1) + several(NETWORKS[1], 1)
     cone = build_analytic({"name": "cone"}).double()
-    for maps in (networks, [networks[0], cone], [Composition(cone, m) for m in [planar()] * 2]):
+    for maps in (
+        networks,
+        [networks[0], cone],
+        [Composition(cone, m) for m in [planar(width=4, depth=1)] * 2],
+    ):
         assert isinstance(batched(maps), OneByOne)
         x = torch.rand(2, 9, 2, dtype=torch.float64) * 0.5
         for a, b in zip(answers(batched(maps), x), each_alone(maps, x), strict=True):
             torch.testing.assert_close(a, b)
-
-
-def planar() -> torch.nn.Module:
-    return build_planar({"width": 4, "depth": 1}).double()

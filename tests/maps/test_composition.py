@@ -4,16 +4,16 @@ import math
 
 import pytest
 import torch
+from map_samples import encoding, network
 from torch import nn
 
 from nsm.maps.analytic import build_analytic
 from nsm.maps.composition import Composition, Rotated
-from nsm.maps.networks import NeuralMap
 
 
 def planar_map(seed=0):
     torch.manual_seed(seed)
-    return NeuralMap(out_dim=2, width=16, depth=2, block="plain").double()
+    return network(out_dim=2, width=16, depth=2, block="plain")
 
 
 def turn(angle):
@@ -28,7 +28,7 @@ def points(n=50):
 MAPS = {
     "analytic": lambda: Composition(build_analytic({"name": "torus_patch"}), planar_map()),
     "neural": lambda: Composition(
-        NeuralMap(width=16, depth=2, encoding={"name": "fourier", "features": 4}).double(),
+        network(enc=encoding("RandomFourierFeatures", features=4), width=16, depth=2),
         planar_map(),
     ),
     "planar": lambda: Composition(planar_map(1), planar_map(2)),

@@ -1,15 +1,16 @@
 """Inverse maps by Newton's method."""
 
 import torch
+from map_samples import activation, planar
+from metric_samples import Disc
+from torch.func import jacfwd, jacrev, vmap
 
-from nsm.maps import TransitionMap, build_planar, inverted
+from nsm.maps import TransitionMap, inverted
 
 
 def stirred(seed, scale=0.15):
     torch.manual_seed(seed)
-    h = build_planar(
-        {"width": 8, "depth": 1, "activation": {"name": "tanh"}, "onto": "disc"}
-    ).double()
+    h = planar("disc", activation("Tanh"), width=8, depth=1)
     for p in h.network.output.parameters():
         torch.nn.init.normal_(p, std=scale)
     return h
@@ -47,6 +48,19 @@ def test_points_of_the_rim_come_back_to_the_rim():
     h = stirred(4, scale=0.08)
     t = torch.linspace(0, 6.28, 200, dtype=torch.float64)
     rim = torch.stack([t.cos(), t.sin()], dim=1)
-    back = TransitionMap(h, h, disc(400), "disc").back(rim)
+    back = TransitionMap(h, h, disc(400), Disc().project).back(rim)
     assert (h(back) - rim).norm(dim=1).max() < 1e-8
     assert (back.norm(dim=1) - 1).abs().max() < 1e-6
+
+
+def test_derivatives_are_those_of_the_inverse_function_theorem():
+    between = TransitionMap(stirred(2), stirred(3), disc(400, seed=1))
+    x = between.first(0.9 * disc(20, seed=2)).detach()
+    value, jacobian = between.value_and_jacobian(x)
+    torch.testing.assert_close(value, between(x))
+    for derivative in (jacrev, jacfwd):
+        expected = vmap(derivative(lambda p: between(p[None])[0]))(x)
+        torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-9)
+    step = 1e-6 * torch.tensor([[1.0, 0.0]], dtype=x.dtype)
+    slope = (between(x + step) - between(x - step)) / 2e-6
+    torch.testing.assert_close(jacobian[..., 0], slope, rtol=0, atol=1e-5)

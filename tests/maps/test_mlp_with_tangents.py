@@ -2,16 +2,18 @@
 
 import pytest
 import torch
+from map_samples import ACTIVATIONS, activation, network
 from torch.autograd.graph import saved_tensors_hooks
 
-from nsm.maps import ACTIVATIONS, BLOCKS, SplineGrid, build_map, mlp_with_tangents
+from nsm.maps import BLOCKS, SplineGrid, mlp_with_tangents
 
 
-def made(activation: str, block: str, depth: int = 2, width: int = 5) -> torch.nn.Module:
+def made(name: str, block: str, depth: int = 2, width: int = 5) -> torch.nn.Module:
     torch.manual_seed(0)
-    activation = {"name": activation, **({"omega": 2.0} if activation == "sine" else {})}
-    net = build_map({"width": width, "depth": depth, "block": block, "activation": activation})
-    net = net.double()
+    act = {"_target_": name}
+    if "." not in name:
+        act = activation(name, **({"omega": 2.0} if name == "Sine" else {}))
+    net = network(act, width=width, depth=depth, block=block)
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.copy_(0.5 * torch.randn_like(parameter))
@@ -42,9 +44,9 @@ def plain_gradients(net: torch.nn.Module, x: torch.Tensor) -> tuple[dict, torch.
 
 
 @pytest.mark.parametrize("block", BLOCKS)
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_finite_differences(activation, block):
-    net = made(activation, block, width=3)
+@pytest.mark.parametrize("name", [*ACTIVATIONS, "torch.nn.Mish"])
+def test_finite_differences(name, block):
+    net = made(name, block, width=3)
     parameters = list(net.parameters())
     assert torch.autograd.gradcheck(
         lambda x, *_: net.value_and_jacobian(x), (points(2).requires_grad_(), *parameters)
@@ -54,10 +56,10 @@ def test_finite_differences(activation, block):
 @pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("at_once", [1, 10**9], ids=["chunks", "whole"])
 @pytest.mark.parametrize("block", BLOCKS)
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_plain_autograd(activation, block, at_once, frozen, monkeypatch):
+@pytest.mark.parametrize("name", [*ACTIVATIONS, "torch.nn.Softsign"])
+def test_plain_autograd(name, block, at_once, frozen, monkeypatch):
     monkeypatch.setattr(mlp_with_tangents, "_AT_ONCE", at_once)
-    net, x = made(activation, block).requires_grad_(not frozen), points().requires_grad_()
+    net, x = made(name, block).requires_grad_(not frozen), points().requires_grad_()
     loss_of(*net.value_and_jacobian(x)).backward()
     by_parameter, by_point = plain_gradients(net, x.detach())
     torch.testing.assert_close(x.grad, by_point, rtol=1e-9, atol=1e-9)
@@ -70,7 +72,7 @@ def test_plain_autograd(activation, block, at_once, frozen, monkeypatch):
 
 def test_parameters_alone():
     """Samples that need no gradient: that by the parameters is the same."""
-    net = made("softplus", "post")
+    net = made("Softplus", "post")
     loss_of(*net.value_and_jacobian(points())).backward()
     for name, expected in plain_gradients(net, points())[0].items():
         torch.testing.assert_close(net.get_parameter(name).grad, expected, rtol=1e-9, atol=1e-9)
@@ -92,7 +94,7 @@ def floats_kept(net: torch.nn.Module, x: torch.Tensor) -> int:
 
 def test_what_is_kept():
     """Of each hidden layer, its result; nothing where there is nothing to differentiate."""
-    net, x = made("softplus", "post", depth=3), points(8)
+    net, x = made("Softplus", "post", depth=3), points(8)
     stack = 3 * 8 * 5
     assert floats_kept(net, x) == 7 * stack + 3 * 8 * 2
     frozen = net.requires_grad_(False)
@@ -111,7 +113,7 @@ def matrix_products(net: torch.nn.Module, x: torch.Tensor) -> int:
 
 
 def test_frozen_weights_cost_nothing():
-    net, x = made("softplus", "plain", depth=3), points().requires_grad_()
+    net, x = made("Softplus", "plain", depth=3), points().requires_grad_()
     layers = 5
     assert matrix_products(net, x) == 3 * layers
     assert matrix_products(net.requires_grad_(False), x) == 2 * layers
@@ -120,16 +122,11 @@ def test_frozen_weights_cost_nothing():
 
 
 def test_no_points_and_no_hidden_layers():
-    net = made("tanh", "plain", depth=0)
+    net = made("Tanh", "plain", depth=0)
     value, jacobian = net.value_and_jacobian(points(0))
     assert value.shape == (0, 3) and jacobian.shape == (0, 3, 2)
     loss_of(value, jacobian).backward()
     assert all((p.grad == 0).all() for p in net.parameters())
-
-
-def test_negative_parameters_are_refused():
-    with pytest.raises(ValueError, match="activation.beta"):
-        build_map({"activation": {"name": "softplus", "beta": -1.0}})
 
 
 @pytest.mark.parametrize("degree", [2, 3])

@@ -2,18 +2,18 @@
 
 import pytest
 import torch
-from torch.func import jacrev, vmap
+from map_samples import PLANAR, activation, planar
+from torch.func import jacfwd, jacrev, vmap
 
-from nsm.energies import signed_distance
-from nsm.maps import build_planar
+from nsm.maps import build_stored
 
-SMALL = {"width": 8, "depth": 1, "activation": {"name": "tanh"}}
+SMALL = {"width": 8, "depth": 1, "act": activation("Tanh")}
 KINDS = [None, "disc", "square"]
 
 
 def stirred(onto, scale=0.3):
     torch.manual_seed(0)
-    h = build_planar({**SMALL, "onto": onto}).double()
+    h = planar(onto, **SMALL)
     for p in h.network.output.parameters():
         torch.nn.init.normal_(p, std=scale)
     return h
@@ -26,7 +26,7 @@ def points(n=64):
 
 @pytest.mark.parametrize("onto", KINDS)
 def test_it_starts_as_the_identity(onto):
-    h = build_planar({**SMALL, "onto": onto}).double()
+    h = planar(onto, **SMALL)
     value, jacobian = h.value_and_jacobian(points())
     assert (value - points()).abs().max() == 0
     assert (jacobian - torch.eye(2)).abs().max() == 0
@@ -37,15 +37,18 @@ def test_jacobians_are_those_of_automatic_differentiation(onto):
     h = stirred(onto)
     value, jacobian = h.value_and_jacobian(points())
     assert (value - h(points())).abs().max() < 1e-12
-    expected = vmap(jacrev(lambda x: h(x[None])[0]))(points())
-    assert (jacobian - expected).abs().max() < 1e-10
+    for derivative in (jacrev, jacfwd):
+        expected = vmap(derivative(lambda x: h(x[None])[0]))(points())
+        assert (jacobian - expected).abs().max() < 1e-10
+    one_by_one = vmap(lambda x: tuple(t[0] for t in h.value_and_jacobian(x[None])))(points())
+    torch.testing.assert_close(one_by_one, (value, jacobian))
 
 
 def test_the_circle_goes_to_itself_and_slides():
     h = stirred("disc")
     t = torch.linspace(0, 6, 40, dtype=torch.float64)
     rim = torch.stack([t.cos(), t.sin()], dim=1)
-    assert signed_distance("disc", h(rim)).abs().max() < 1e-12
+    assert (h(rim).norm(dim=1) - 1).abs().max() < 1e-12
     assert (h(rim) - rim).abs().max() > 0.05
 
 
@@ -63,11 +66,21 @@ def test_each_side_of_the_square_goes_to_itself_and_corners_stay():
 @pytest.mark.parametrize("onto", KINDS)
 def test_config_builds_the_same_kind(onto):
     h = stirred(onto)
-    twin = build_planar(h.config).double()
+    twin = build_stored(h.config).double()
     twin.load_state_dict(h.state_dict())
+    assert twin.config == h.config
     assert (twin(points()) - h(points())).abs().max() == 0
 
 
-def test_other_domains_are_refused():
-    with pytest.raises(ValueError, match="triangle"):
-        build_planar({**SMALL, "onto": "triangle"})
+@pytest.mark.parametrize("onto", KINDS)
+def test_a_network_of_the_user_is_zero_at_the_start(onto):
+    kind = PLANAR[onto]
+    network = torch.nn.Sequential(
+        torch.nn.Linear(2, 4), torch.nn.Tanh(), torch.nn.Linear(4, kind.network_out_dim)
+    )
+    assert torch.equal(kind(network)(points().float()), points().float())
+
+
+def test_a_network_without_a_last_layer_is_refused():
+    with pytest.raises(ValueError):
+        PLANAR[None](torch.nn.Tanh())
