@@ -207,13 +207,14 @@ class _Request:
         for key, value in settings.items():
             if key not in known:
                 raise unknown_setting(key)
-            if (conf_folder() / key).is_dir() and (value is None or isinstance(value, str)):
+            if value is None or isinstance(value, str) and (conf_folder() / key).is_dir():
                 chosen.append(f"{key}={'null' if value is None else value}")
             else:
                 merged[key] = _plain(value)
         keys = [word.lstrip("+~").partition("=")[0] for word in overrides]
         for key in (*keys, *settings):
-            self._check(key, ready)
+            if key != "task" or not isinstance(merged.get(key), dict):  # a variant of the task
+                self._check(key, ready)
         for key in settings:
             twice = [k for k in keys if k == key or k.startswith(f"{key}.")]
             if twice:
