@@ -39,7 +39,8 @@ class NotTrusted(NsmError):
         module = target.split(".")[0]
         super().__init__(
             f"it names {target[:80]!r}, which is not nsm's: loading would run code of the module "
-            f"{module[:60]!r}; if you trust it, give trust={module[:60]}",
+            f"{module[:60]!r}; if you trust it, give trust={module[:60]} (nsm report and nsm view: "
+            f"--trust {module[:60]})",
             kind="not_trusted",
             key=module,
         )

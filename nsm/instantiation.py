@@ -16,17 +16,18 @@ from typing import Any
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from nsm.errors import NotTrusted, NsmError
 
-# rooms whose classes only compute: making one reads and writes no file
-_ROOMS = ("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.extensions")
-_TASKS = tuple(
-    f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map")
+# packages and modules whose classes only compute: making one reads and writes no file; loggers get
+# their folder from the run
+_OURS = (
+    *("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.results.loggers"),
+    *(f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map")),
 )
-_TORCH_MODULES = ("torch.nn.modules.activation", "torch.optim", "torch.optim.lr_scheduler")
-_TORCH_NAMES = ("torch.nn.", "torch.optim.")
-_LOGGERS = ("nsm.results.loggers",)
+_TORCH = ("torch.nn.modules.activation", "torch.optim")
+REGISTERED = "nsm.extensions.registered"  # what the user's process put there
 
 
 def made(config: Any, *args: Any, **kwargs: Any) -> Any:
@@ -78,50 +79,65 @@ def made_with(config: Mapping[str, Any], **offered: Any) -> Any:
 
 
 def is_trusted(target: str, trust: Iterable[str] = ()) -> bool:
-    """Whether a stored ``_target_`` may be made: nsm's, torch's by the list, or a trusted module's.
+    """Whether a stored ``_target_`` may be made.
 
-    Nothing is imported to find out but modules of nsm, torch and those trusted; a path that reaches
-    another module through an import of an allowed one is refused.
+    It may be a class that is defined in nsm's computing packages or on torch's short list, a class
+    or function that is defined in a trusted module, or what this process registered. Only these
+    modules and torch's are imported to find out. A path that leaves them through one of their
+    imports, such as ``mypackage.os.system``, is refused.
     """
-    if any(target == module or target.startswith(f"{module}.") for module in trust):
-        return True
-    homes: tuple[str, ...]
-    if target.startswith(tuple(f"{room}." for room in (*_ROOMS, *_TASKS, *_LOGGERS))):
-        homes = (*_ROOMS, *_TASKS, *_LOGGERS)
-    elif target.startswith(_TORCH_NAMES):
-        homes = _TORCH_MODULES
-    else:
-        return False
+    trust = _modules(trust)
     module, _, name = target.rpartition(".")
+    if not _within(module, (*_OURS, REGISTERED, "torch.nn", "torch.optim", *trust)):
+        return False
     try:
         thing = getattr(importlib.import_module(module), name, None)
-    except ImportError:
+    except (ImportError, ValueError):  # no such module, or no name of a module
         return False
+    if module == REGISTERED:
+        return thing is not None
     home = getattr(thing, "__module__", None)
-    if not inspect.isclass(thing) and not inspect.isfunction(thing):
-        return False
-    return isinstance(home, str) and any(home == h or home.startswith(f"{h}.") for h in homes)
+    if inspect.isclass(thing):
+        return _within(home, (*_OURS, *_TORCH, *trust))
+    return inspect.isfunction(thing) and _within(home, trust)
+
+
+def _within(module: object, packages: Iterable[str]) -> bool:
+    return any(module == p or str(module).startswith(f"{p}.") for p in packages)
+
+
+def _modules(trust: Iterable[str]) -> tuple[str, ...]:
+    return (trust,) if isinstance(trust, str) else tuple(trust)
 
 
 def instantiate_stored(config: Any, *args: Any, trust: Iterable[str] = (), **kwargs: Any) -> Any:
     """As :func:`made`, of settings that may be a stranger's.
 
     Raises:
-        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within.
-        NsmError: as :func:`made`.
+        NotTrusted, NsmError: as :func:`check_trusted` and :func:`made`.
     """
     check_trusted(config, trust)
     return made(config, *args, **kwargs)
 
 
 def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
-    """NotTrusted for stored settings in which a target is not to be trusted."""
-    trust = tuple(trust)
+    """Refuse stored settings that would run code which is not to be trusted.
+
+    Raises:
+        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within.
+        NsmError: ``interpolation``: a text with ``${``, which may make a target of another text.
+    """
+    trust = _modules(trust)
+    if OmegaConf.is_config(config):
+        config = OmegaConf.to_container(config, resolve=False)
+    if isinstance(config, str) and "${" in config:
+        message = f"{config[:80]!r} is an interpolation, which stored settings may not hold"
+        raise NsmError(message, kind="interpolation")
     if isinstance(config, Mapping):
         if "_target_" in config and not is_trusted(str(config["_target_"]), trust):
             raise NotTrusted(str(config["_target_"]))
-        for value in config.values():
-            check_trusted(value, trust)
+        for item in config.items():
+            check_trusted(item, trust)
     elif isinstance(config, (list, tuple)):
         for value in config:
             check_trusted(value, trust)

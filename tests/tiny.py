@@ -1,4 +1,4 @@
-"""A small result of every kind, made without a training."""
+"""A small result of every kind, without training."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from nsm.domains import Surface
-from nsm.maps import NeuralMap, Rotated, build_planar
+from nsm.maps import DiscMap, NeuralMap, PlanarMap, Rotated
 from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
 from nsm.surfaces.shapes import ring_mesh
 
@@ -37,7 +37,7 @@ class Results(NamedTuple):
 
 
 def stirred(module: torch.nn.Module) -> torch.nn.Module:
-    """A network that maps to something, injectively: its weights moved a little, and frozen."""
+    """A network with its weights moved a little, and frozen; planar maps stay injective."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -45,9 +45,9 @@ def stirred(module: torch.nn.Module) -> torch.nn.Module:
     return module.eval().requires_grad_(False)
 
 
-def planar(onto: str | None = "disc") -> torch.nn.Module:
+def planar(kind: type[PlanarMap] | type[DiscMap] = DiscMap) -> torch.nn.Module:
     """A map of the plane that is near the identity."""
-    return stirred(build_planar({**NETWORK, "onto": onto}))
+    return stirred(kind(NeuralMap(out_dim=kind.network_out_dim, **NETWORK)))
 
 
 def dome(height: float, rings: int) -> Surface:
@@ -71,7 +71,7 @@ def results(rings: int) -> Results:
     h = [Rotated(planar(), torch.eye(2)) for _ in neural]
     return Results(
         neural,
-        Parameterization(neural[0], planar(None)),
+        Parameterization(neural[0], planar(PlanarMap)),
         SurfaceMap(neural[0], neural[1], h[0], np.array([[0, 0], [5, 6]])),
         SurfaceCollection(neural, h, np.array([[0, 0, 0]])),
     )

@@ -199,7 +199,11 @@ def seam_costs(vertices: np.ndarray, faces: np.ndarray, seam: str) -> np.ndarray
     if seam == "shortest":
         return length
     if seam != "hidden":
-        raise NsmError(f"seam={seam} is not one of {', '.join(SEAMS)}")
+        raise NsmError(
+            f"seam.path={seam} is not one of {', '.join(SEAMS)}",
+            kind="unknown_option",
+            key="seam.path",
+        )
     visible = 1 - ambient_occlusion(vertices, faces)[topology.edges_of(faces).pairs].mean(axis=1)
     return length * (1 + _VISIBLE_COST * visible)
 

@@ -127,7 +127,11 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
     kept = mesh.merged[landmarks]
     for given, vertex in zip(landmarks, kept, strict=True):
         if vertex < 0:
-            raise NsmError(f"{name}: landmark {given} is not on the surface; give another vertex")
+            raise NsmError(
+                f"{name}: landmark {given} is not on the surface; give another vertex",
+                kind="not_on_surface",
+                key=name,
+            )
     return kept
 
 
@@ -173,7 +177,9 @@ def _cut_alike(
     if best is None:
         raise NsmError(
             "no seams through the landmarks were found: some are too close together for the "
-            "meshes' edges; leave one of them out, or subdivide the mesh"
+            "meshes' edges; leave one of them out, or subdivide the mesh",
+            kind="no_common_seam",
+            key="landmarks",
         )
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     words = (
@@ -349,7 +355,9 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
         names = " and ".join(s.name for s in surfaces)
         raise NsmError(
             f"the boundaries of {names}, once cut, pass the landmarks differently; give meshes "
-            "instead of ready surfaces, so that they are cut alike, or other landmarks"
+            "instead of ready surfaces, so that their seams correspond, or other landmarks",
+            kind="no_common_seam",
+            key="landmarks",
         )
     inner = np.setdiff1d(np.arange(len(landmarks[0])), keys[0][:, 0])
     points = [

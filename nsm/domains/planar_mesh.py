@@ -8,12 +8,25 @@ import numpy as np
 from nsm.surfaces.predicates import orientation
 
 
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Signed areas (N,) of the parallelograms of vectors u and v (N,2)."""
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+
+
 def signed_areas(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Signed areas (F,) of the triangles of a flat mesh (V,2)."""
     a, b, c = (uv[faces[:, k]] for k in range(3))
-    return 0.5 * (
-        (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    )
+    return 0.5 * cross(b - a, c - a)
+
+
+def symmetric_dirichlet(norm: np.ndarray, determinant: np.ndarray) -> np.ndarray:
+    """‖J‖² + ‖J⁻¹‖² (N,) of maps in the plane, by ‖J‖² and det J (N,); inf unless det J > 0.
+
+    Linear in ``norm``, which may come with a weight. For maps between meshes with the smoothing ε
+    of METHOD Eq. 2 see :func:`nsm.surfaces.geometry.triangle_distortion`.
+    """
+    positive = determinant > 0
+    return np.where(positive, norm * (1 + 1 / np.where(positive, determinant, 1.0) ** 2), np.inf)
 
 
 def flipped_triangles(uv: np.ndarray, faces: np.ndarray) -> int:

@@ -85,7 +85,9 @@ class Surface:
         if not isinstance(path_or_name, (str, Path)):
             kind = type(path_or_name).__name__
             raise NsmError(
-                f"a {kind} is no mesh file; give its path, or the arrays to Surface.from_arrays"
+                f"a {kind} is no mesh file; give its path, or the arrays to Surface.from_arrays",
+                kind="wrong_type",
+                key="path_or_name",
             )
         text = str(path_or_name)
         if Path(text).suffix or "/" in text or "\\" in text or Path(text).exists():
@@ -159,7 +161,9 @@ class Surface:
                 if not 0 <= v < len(mesh.merged) or mesh.merged[v] < 0:
                     raise NsmError(
                         f"{name}: seam vertex {v} is not on the mesh "
-                        f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices"
+                        f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices",
+                        kind="not_on_surface",
+                        key="seam_vertices",
                     )
             seam = [int(mesh.merged[v]) for v in seam]
         cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
@@ -202,7 +206,9 @@ class Surface:
         if flipped or crossings:
             raise NsmError(
                 f"{name}: the parameterization is not injective ({flipped} flipped triangles, "
-                f"{crossings} boundary crossings); give seam_vertices at the tips of long parts"
+                f"{crossings} boundary crossings); give seam_vertices at the tips of long parts",
+                kind="not_injective",
+                key=name,
             )
         source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
         first = first_copies(cut.origin, len(mesh.vertices))
@@ -298,7 +304,9 @@ class Surface:
             if not 0 <= vertex < len(self.cut_vertex) or self.cut_vertex[vertex] < 0:
                 raise NsmError(
                     f"{self.name}: vertex {vertex} is not on the surface "
-                    f"(0 to {len(self.cut_vertex) - 1}); give another landmark"
+                    f"(0 to {len(self.cut_vertex) - 1}); give another landmark",
+                    kind="not_on_surface",
+                    key=self.name,
                 )
         return self.cut_vertex[np.array(numbers, dtype=np.int64)]
 
@@ -330,5 +338,5 @@ def _numbers(given: Any, what: str) -> list[int]:
     """Vertex numbers; NsmError for anything else than a list of whole numbers."""
     numbers = listed(given, what)
     if not isinstance(numbers, list):
-        raise NsmError(f"{what}: give vertex numbers")
+        raise NsmError(f"{what}: give vertex numbers", kind="wrong_type", key=what)
     return numbers

@@ -13,7 +13,7 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from nsm.domains.planar_mesh import flipped
+from nsm.domains.planar_mesh import cross, flipped, signed_areas
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
@@ -73,19 +73,16 @@ def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndar
     affine = _affine_fit(rest[vertices], image[vertices])
     if affine is None:
         return
-    a, b, c = (rest[faces[:, k]] @ affine.T for k in range(3))
-    shape = np.stack([b - a, c - a], axis=2)
-    with np.errstate(all="ignore"):
-        area = np.linalg.det(shape)
-        if not (area > 0).all():
-            return
-        inverse = np.linalg.inv(shape)
+    shape = rest @ affine.T
+    area = signed_areas(shape, faces)
+    if not (area > 0).all():
+        return
+    inverse = _cofactors(_sides(shape, faces)).transpose(0, 2, 1) / (2 * area[:, None, None])
     moving = vertices[free[vertices]]
     trial = image.copy()
 
     def determinants() -> np.ndarray:
-        p, q, r = (trial[faces[:, k]] for k in range(3))
-        return np.linalg.det(np.stack([q - p, r - p], axis=2)) / area
+        return signed_areas(trial, faces) / area
 
     least = determinants().min()
     for _ in range(_ROUNDS):
@@ -120,6 +117,18 @@ def _affine_fit(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
     return matrix if np.linalg.det(matrix) > 0 else None
 
 
+def _sides(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Matrices (F, 2, 2) whose columns are two sides of each triangle."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.stack([b - a, c - a], axis=2)
+
+
+def _cofactors(matrices: np.ndarray) -> np.ndarray:
+    """The derivatives (F, 2, 2) of determinants by the entries of matrices (F, 2, 2)."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0)
+    return np.stack([np.stack([d, -c], axis=1), np.stack([-b, a], axis=1)], axis=1)
+
+
 def _energy(
     points: np.ndarray, faces: np.ndarray, inverse: np.ndarray, epsilon: float
 ) -> tuple[float, np.ndarray]:
@@ -127,23 +136,15 @@ def _energy(
 
     χ(d) = (d + √(ε² + d²)) / 2 is positive, whatever d is.
     """
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    jacobian = np.stack([b - a, c - a], axis=2) @ inverse
-    d = np.linalg.det(jacobian)
+    jacobian = _sides(points, faces) @ inverse
+    d = cross(jacobian[:, :, 0], jacobian[:, :, 1])
     root = np.sqrt(epsilon**2 + d**2)
     # for d < 0 the difference would cancel
     chi = np.where(d > 0, 0.5 * (d + root), 0.5 * epsilon**2 / (root - np.minimum(d, 0)))
     slope = chi / root
     top = (jacobian**2).sum(axis=(1, 2)) + d**2 + 1
-    cofactor = np.stack(
-        [
-            np.stack([jacobian[:, 1, 1], -jacobian[:, 1, 0]], axis=1),
-            np.stack([-jacobian[:, 0, 1], jacobian[:, 0, 0]], axis=1),
-        ],
-        axis=1,
-    )
     by_d = (2 * d - top * slope / chi) / chi
-    force = 2 * jacobian / chi[:, None, None] + by_d[:, None, None] * cofactor
+    force = 2 * jacobian / chi[:, None, None] + by_d[:, None, None] * _cofactors(jacobian)
     edges = force @ inverse.transpose(0, 2, 1)  # columns: by b - a and by c - a
     gradient = np.zeros_like(points)
     np.add.at(gradient, faces[:, 1], edges[:, :, 0])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nsm.domains.decimation import Rings
+from nsm.domains.planar_mesh import cross, symmetric_dirichlet
 from nsm.surfaces import topology
 
 if TYPE_CHECKING:
@@ -76,19 +77,15 @@ class Stars:
     def energy(self, uv: np.ndarray, at: np.ndarray) -> np.ndarray:
         """Energy (N,) of each star with its vertex at (N, 2); inf where a triangle has no area."""
         x, y = at[self.star] - uv[self.b], uv[self.c] - uv[self.b]
-        det = (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) * self.d
-        return self._sum(np.where(det > 0, self._dirichlet(x, y) * (1 + self._power(det)), np.inf))
+        return self._sum(symmetric_dirichlet(self._norm(x, y), cross(y, x) * self.d))
 
-    def _dirichlet(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def _norm(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """‖J‖² times the area on the mesh (M,), by the sides x = p - b, y = c - b (M, 2)."""
         return (
             self.a * (x * x).sum(axis=1)
             + 2 * self.e * (x * y).sum(axis=1)
             + self.f * (y * y).sum(axis=1)
         )
-
-    @staticmethod
-    def _power(det: np.ndarray) -> np.ndarray:
-        return 1 / np.where(det > 0, det, 1.0) ** 2
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
         return np.bincount(self.star, weights=values, minlength=len(self.vertex))
@@ -96,8 +93,8 @@ class Stars:
     def derivatives(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Energy (N,), gradient (N, 2) and second derivatives xx, xy, yy (N, 3) as they lie."""
         x, y = uv[self.vertex[self.star]] - uv[self.b], uv[self.c] - uv[self.b]
-        det = (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) * self.d
-        q = self._dirichlet(x, y)
+        det = cross(y, x) * self.d
+        q = self._norm(x, y)
         p2 = 1 / det**2
         p3 = -2 * p2 / det
         q4 = 6 * q * p2**2
@@ -176,9 +173,9 @@ def _newton(gradient: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _first_collapse(uv: np.ndarray, stars: Stars, direction: np.ndarray) -> np.ndarray:
     """The multiple (N,) of each step (N, 2) at which a triangle of the star loses its area."""
     x, y = uv[stars.vertex[stars.star]] - uv[stars.b], uv[stars.c] - uv[stars.b]
-    area = y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]
+    area = cross(y, x)
     by = direction[stars.star]
-    change = y[:, 0] * by[:, 1] - y[:, 1] * by[:, 0]
+    change = cross(y, by)
     rate = np.zeros(len(stars.vertex))
     np.maximum.at(rate, stars.star, -change / area)
     return 1 / np.maximum(rate, 1e-300)

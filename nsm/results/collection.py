@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +15,21 @@ import torch
 from torch import nn
 
 from nsm.errors import NsmError
-from nsm.maps import TransitionMap
+from nsm.maps import PlanarMap, TransitionMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, combined
-from nsm.results.files import BROKEN, misfit, read_pair, write_pair
+from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.networks import network_of
+from nsm.results.networks import rotated_map
 from nsm.results.pair_metrics import pair_metrics
-from nsm.results.surface_map import SurfaceMap, rotated_planar
+from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces.location import locate
 
 FORMAT = "nsm-collection"
-VERSION = 1
 STEM = "collection"
-_CYCLE_EVERY = 7  # vertices, of which one is taken
-_CHUNK = 16_384  # vertices whose way back is found at once
-_MOST_CYCLES = 60  # there are k³ of them
+_CYCLE_EVERY = 7  # every so many vertices, one is followed around a cycle
+_CHUNK = 16_384  # vertices whose h_i⁻¹ is computed at once
+_MOST_CYCLES = 60  # of k³
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class SurfaceCollection:
         landmarks: (L, k) vertices of the mesh files.
         metrics: figures of :func:`collection_metrics`.
         config: the settings of the run that made it.
-        corrections: of the pairs (source, target) that :meth:`repaired` had to mend.
+        corrections: of the pairs (source, target) that :meth:`repaired` changed.
     """
 
     surfaces: list[NeuralSurface]
@@ -56,15 +57,29 @@ class SurfaceCollection:
     def __len__(self) -> int:
         return len(self.surfaces)
 
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the surfaces; of equal ones the second is NAME-2, and so on."""
+        names: list[str] = []
+        for name in (phi.surface.name for phi in self.surfaces):
+            candidates = [name, *(f"{name}-{k}" for k in range(2, len(self) + 2))]
+            names.append(next(n for n in candidates if n not in names))
+        return names
+
+    def pair_name(self, source: int, target: int) -> str:
+        """The name of an ordered pair, "SOURCE → TARGET"."""
+        return f"{self.names[source]} → {self.names[target]}"
+
     def pair(self, source: int, target: int) -> SurfaceMap:
-        """The map F_{source→target}: points, transfer and morph from any surface to any other.
+        """The map F_{source→target} from any surface to any other, by number.
 
         Raises:
-            NsmError: a number that no surface has.
+            NsmError: ``out_of_range``: a number that no surface has.
         """
         for number in (source, target):
             if number not in range(len(self)):
-                raise NsmError(f"surface {number!r} is not one of 0 to {len(self) - 1}")
+                message = f"surface {number!r} is not one of 0 to {len(self) - 1}"
+                raise NsmError(message, kind="out_of_range", key="surface")
         if (source, target) not in self._made:
             self._made[source, target] = self._pair(source, target)
         return self._made[source, target]
@@ -90,17 +105,22 @@ class SurfaceCollection:
         first = self.maps[source]
         turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
         nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
-        onto = first.inner.config.get("onto")  # type: ignore[union-attr, operator]
-        h = TransitionMap(_double(first), _double(self.maps[target]), nodes, onto)
-        ids = self.landmarks[:, [source, target]]
-        ends = self.surfaces[source], self.surfaces[target]
-        correction = self.corrections.get((source, target), Correction())
-        result = SurfaceMap(*ends, h.eval(), ids, {}, self.config, correction)
-        if source not in self._back:  # of a surface's k - 1 maps the part that takes longest
+        free = isinstance(first.inner, PlanarMap)
+        project = None if free else self.surfaces[source].surface.domain.project
+        h = TransitionMap(_double(first), _double(self.maps[target]), nodes, project).eval()
+        if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
             uv = torch.as_tensor(self.surfaces[source].surface.uv)
             self._back[source] = torch.cat([h.back(part) for part in uv.split(_CHUNK)]).numpy()
-        result.__dict__["image_uv"] = correction.of(evaluate(h.second, self._back[source]))
-        return result
+        return SurfaceMap(
+            self.surfaces[source],
+            self.surfaces[target],
+            h,
+            self.landmarks[:, [source, target]],
+            {},
+            self.config,
+            self.corrections.get((source, target), Correction()),
+            evaluate(h.second, self._back[source]),
+        )
 
     def save(self, folder: str | Path) -> None:
         """Write the maps into a folder, and each surface into ``surface_0``, ... there.
@@ -112,35 +132,32 @@ class SurfaceCollection:
         tensors = {}
         for k, (surface, h) in enumerate(zip(self.surfaces, self.maps, strict=True)):
             save_surface(place / f"surface_{k}", surface)
-            tensors.update({f"{k}.{n}": v.contiguous() for n, v in h.state_dict().items()})
+            tensors.update({f"{k}.{name}": v for name, v in h.state_dict().items()})
         for (i, j), correction in self.corrections.items():
             tensors.update(correction.tensors(f"{i}_to_{j}."))
-        words = {
+        metadata = {
             "map": self.maps[0].inner.config,  # type: ignore[union-attr]
             "count": len(self),
             "landmarks": self.landmarks.tolist(),
             "metrics": self.metrics,
             "config": self.config,
         }
-        write_pair(place / STEM, FORMAT, VERSION, tensors, words)
+        write_pair(place / STEM, FORMAT, tensors, metadata)
 
 
-def load_collection(folder: str | Path) -> SurfaceCollection:
+def load_collection(folder: str | Path, trust: Iterable[str] = ()) -> SurfaceCollection:
     """Read what :meth:`SurfaceCollection.save` wrote.
 
-    Raises:
-        NsmError: files that are missing, truncated, damaged, or of another version.
+    Args, Raises:
+        as for :func:`nsm.results.load_surface`.
     """
     place = Path(folder)
-    tensors, words = read_pair(place / STEM, FORMAT, VERSION)
+    tensors, metadata = read_pair(place / STEM, FORMAT)
     try:
-        count = int(words["count"])
+        count = int(metadata["count"])
         if not 2 < count <= len(tensors):
             raise ValueError(f"{count} surfaces")
-    except BROKEN as error:
-        raise misfit(place / STEM, error) from error
-    surfaces = [load_surface(place / f"surface_{k}") for k in range(count)]
-    try:
+        surfaces = [load_surface(place / f"surface_{k}", trust) for k in range(count)]
         corrections = {}
         for i, j in itertools.permutations(range(count), 2):
             found = Correction.taken(tensors, len(surfaces[i].surface.vertices), f"{i}_to_{j}.")
@@ -148,22 +165,20 @@ def load_collection(folder: str | Path) -> SurfaceCollection:
                 corrections[i, j] = found
         maps: list[nn.Module] = []
         for k in range(count):
-            own = {
-                n.split(".", 1)[1]: v for n, v in tensors.items() if n.split(".", 1)[0] == str(k)
-            }
-            h = network_of(rotated_planar, words["map"], own)
-            maps.append(h.eval().requires_grad_(False))
-        landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, count)
-        metrics, config = dict(words["metrics"]), dict(words["config"])
-    except BROKEN as error:
-        raise misfit(place / STEM, error) from error
+            split = {name: name.partition(".") for name in tensors}
+            own = {end: tensors[n] for n, (start, _, end) in split.items() if start == str(k)}
+            maps.append(rotated_map(metadata["map"], own, trust))
+        landmarks = np.array(metadata["landmarks"], dtype=np.int64).reshape(-1, count)
+        metrics, config = dict(metadata["metrics"]), dict(metadata["config"])
+    except DAMAGE as error:
+        raise damaged(place / STEM, error) from error
     return SurfaceCollection(surfaces, maps, landmarks, metrics, config, corrections)
 
 
 def collection_metrics(
     collection: SurfaceCollection, points: np.ndarray, targets: Sequence[np.ndarray]
 ) -> dict[str, Any]:
-    """Every ordered pair's figures, and the cycle error.
+    """The figures of every ordered pair, and the cycle error.
 
     Args:
         collection: the surfaces and their maps.
@@ -171,12 +186,12 @@ def collection_metrics(
         targets: (K, 2) the same in each surface's own domain.
 
     Returns:
-        ``pairs``: "i → j" to the figures of :func:`nsm.results.pair_metrics` and the map's
-        certificate; the certificate of all; cycle_error_mean and _max_percent: how far i→j→k→i
-        misses a vertex, of the diagonal, over the cycles (of more than 60, 60 evenly spread); the
-        same of the networks
-        (cycle_error_networks_...), which close but for where h_i⁻¹ is not found, while the maps
-        are linear on the triangles of each surface.
+        ``pairs``: name of the pair to the figures of :func:`nsm.results.pair_metrics` and its
+        certificate; the certificate of all; cycle_error_mean_percent and _max_percent: the
+        distance by which i→j→k→i misses a vertex, of the diagonal, over the cycles (if there are
+        more than 60, over 60 evenly spread); and the same of the networks alone
+        (cycle_error_networks_...). Those close wherever h_i⁻¹ is found; the maps, which are linear
+        on the triangles of each surface, close approximately.
     """
     pairs = {}
     for i, j in itertools.permutations(range(len(collection)), 2):
@@ -184,7 +199,7 @@ def collection_metrics(
         s, t = f.source.surface, f.target.surface
         landed = f.planar(targets[i]) if len(points) else points
         own = pair_metrics(s, t, f.image_uv, landed, targets[j])
-        pairs[f"{s.name} → {t.name}"] = {**own, **f.certificate}
+        pairs[collection.pair_name(i, j)] = {**own, **f.certificate}
     figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
     cycles = list(itertools.permutations(range(len(collection)), 3))
     cycles = cycles[:: -(-len(cycles) // _MOST_CYCLES)]
@@ -196,7 +211,7 @@ def collection_metrics(
 
 
 def _cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
-    """Distance (V,) between a vertex of i and its image by i→j→k→i, in percent of the diagonal."""
+    """Distances (V,) of vertices of i from their images by i→j→k→i, in percent of the diagonal."""
     surface = collection.surfaces[i]
     start = surface.in_original_units(surface.surface.vertices[::_CYCLE_EVERY])
     points = start
@@ -207,7 +222,7 @@ def _cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.nd
 
 
 def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
-    """The same (V,) by the networks alone, from domain to domain."""
+    """As :func:`_cycle_error`, by the networks alone, from domain to domain."""
     surface = collection.surfaces[i].surface
     uv = surface.uv[::_CYCLE_EVERY]
     for a, b in ((i, j), (j, k), (k, i)):
@@ -218,7 +233,5 @@ def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int)
 
 
 def _double(h: nn.Module) -> nn.Module:
-    """A copy in float64, for Newton's last digits."""
-    import copy
-
+    """A copy in float64, for the last digits of Newton's method."""
     return copy.deepcopy(h).double()

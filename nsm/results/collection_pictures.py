@@ -1,4 +1,4 @@
-"""Pictures of collections: all ordered pairs as matrices."""
+"""Pictures of collections: matrices of all ordered pairs."""
 
 from __future__ import annotations
 
@@ -17,14 +17,13 @@ _SHOWN = {
     "landmark_error_max_percent": "largest landmark error, % of diagonal",
 }
 _CELL = 300
-# of a larger collection, the picture of so many surfaces would be one of hundreds of megabytes
+# the picture of a larger collection would take hundreds of megabytes
 _MOST_DRAWN = 8
 
 
 def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
-    """Main figures of every ordered pair, from row to column."""
-    names = [phi.surface.name for phi in collection.surfaces]
-    k = len(names)
+    """The main figures of every ordered pair, from row to column."""
+    names, k = collection.names, len(collection)
     side = max(5.0, 0.5 * k)  # inches: the numbers do not overlap
     figure = Figure(figsize=((side + 0.2) * len(_SHOWN), side), dpi=120)
     for n, (key, title) in enumerate(_SHOWN.items()):
@@ -32,7 +31,7 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
         for i in range(k):
             for j in range(k):
                 if i != j:
-                    values[i, j] = collection.metrics["pairs"][f"{names[i]} → {names[j]}"][key]
+                    values[i, j] = collection.metrics["pairs"][collection.pair_name(i, j)][key]
         axes = figure.add_subplot(1, len(_SHOWN), n + 1)
         axes.imshow(values, cmap="viridis_r")
         middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
@@ -49,7 +48,7 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
 
 
 def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> None:
-    """Row i, column j: the checkerboard of surface i carried to surface j; of the first eight."""
+    """Row i, column j: the checkerboard of surface i on surface j, for the first eight."""
     rows = []
     drawn = collection.surfaces[:_MOST_DRAWN]
     views = [View(phi.surface.vertices, _CELL) for phi in drawn]
@@ -58,7 +57,7 @@ def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> 
         for j, target in enumerate(drawn):
             t = target.surface
             uv = source.surface.uv if i == j else collection.pair(i, j).source_uv
-            title = f"{source.surface.name} → {t.name}" if i != j else t.name
+            title = collection.names[i] if i == j else collection.pair_name(i, j)
             row.append((views[j].draw(t.vertices, t.faces, checked(uv), t.seam_pairs), title))
         rows.append(row)
     save_figure(panels(*rows), path)

@@ -1,7 +1,7 @@
-"""Files that are whole or not there at all, and artefacts as pairs of them.
+"""Files that are written whole or not at all, and artefacts as pairs of them.
 
-An artefact is STEM.safetensors (weights and arrays) beside STEM.json (everything else, and the
-checksum of the first). Loading executes nothing from them: there is no pickle.
+An artefact is STEM.safetensors (weights and arrays) beside STEM.json (its metadata: settings,
+figures, and the checksum of the first). There is no pickle: loading runs no code of theirs.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from nsm.errors import NotRegistered, NsmError
+from nsm.errors import NotRegistered, NotTrusted, NsmError
+from nsm.results.old_versions import from_version_1
 
-# What the words and arrays of a damaged or forged artefact may raise while it is put together.
-BROKEN = (
+VERSION = 2
+# what the metadata and tensors of a damaged or forged artefact may raise while it is put together
+DAMAGE = (
     KeyError,
     TypeError,
     ValueError,
@@ -37,12 +39,10 @@ BROKEN = (
     NsmError,
 )
 
-
-# what the pickle of a checkpoint may call, and all of pickle's ways to name something
+# what the pickle of a checkpoint needs
 _CALLED = re.compile(
     r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch (\w+Storage|Size)"
 )
-_NAMING = ("GLOBAL", "STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4")
 
 
 def atomic_write(path: str | Path, data: bytes) -> None:
@@ -81,23 +81,29 @@ def flush_folder(folder: Path) -> None:
 
 
 def write_pair(
-    stem: Path, form: str, version: int, tensors: Mapping[str, Tensor], words: Mapping[str, Any]
+    stem: Path, form: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
 ) -> None:
-    """Write an artefact, whole or not at all: the one before holds until its JSON is replaced.
+    """Write an artefact, whole or not at all: the one before stays until its JSON is replaced.
 
     The old tensors stay beside the new ones, as STEM.previous.safetensors, until then.
+
+    Args:
+        stem: path of the two files without their endings.
+        form: name of the format.
+        tensors: weights and arrays.
+        metadata: what goes into the JSON.
 
     Raises:
         OSError: the folder cannot be written.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    data = save(dict(tensors))
-    head = {"format": form, "version": version, "sha256": hashlib.sha256(data).hexdigest()}
+    data = save({name: tensor.contiguous() for name, tensor in tensors.items()})
+    head = {"format": form, "version": VERSION, "sha256": hashlib.sha256(data).hexdigest()}
     file, previous = stem.with_suffix(".safetensors"), _previous(stem)
     if file.exists() and not _is_committed(stem, previous):
         os.replace(file, previous)
     atomic_write(file, data)
-    atomic_write(stem.with_suffix(".json"), as_json({**head, **words}))
+    atomic_write(stem.with_suffix(".json"), as_json({**head, **metadata}))
     previous.unlink(missing_ok=True)
 
 
@@ -106,95 +112,111 @@ def _previous(stem: Path) -> Path:
 
 
 def _is_committed(stem: Path, previous: Path) -> bool:
-    """Whether a writing that was cut short left the tensors that the JSON means in ``previous``."""
+    """Whether a write that was interrupted left the tensors of the JSON in ``previous``."""
     try:
-        words = json.loads(stem.with_suffix(".json").read_bytes())
+        metadata = json.loads(stem.with_suffix(".json").read_bytes())
         data = previous.read_bytes()
     except (OSError, ValueError):
         return False
-    return isinstance(words, dict) and words.get("sha256") == hashlib.sha256(data).hexdigest()
+    return isinstance(metadata, dict) and metadata.get("sha256") == hashlib.sha256(data).hexdigest()
 
 
-def as_json(words: Any) -> bytes:
-    """JSON text that every reader takes: figures that are not finite become null."""
-    return (json.dumps(_finite(words), indent=2, allow_nan=False) + "\n").encode()
+def as_json(metadata: Any) -> bytes:
+    """Standard JSON: numbers that are not finite become null."""
+    return (json.dumps(_finite(metadata), indent=2, allow_nan=False) + "\n").encode()
 
 
-def _finite(words: Any) -> Any:
-    if isinstance(words, Mapping):
-        return {key: _finite(value) for key, value in words.items()}
-    if isinstance(words, (list, tuple)):
-        return [_finite(value) for value in words]
-    return None if isinstance(words, float) and not math.isfinite(words) else words
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def read_pair(stem: Path, form: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and words of an artefact.
+def read_pair(stem: Path, form: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and metadata of an artefact; those of version 1 as version 2 has them.
+
+    Args:
+        stem: path of the two files without their endings.
+        form: name of the format.
 
     Raises:
-        NsmError: a file that is missing, truncated, damaged, of another format or version.
+        NsmError: ``missing_file``, ``unreadable_file``, ``wrong_format``, ``wrong_version``,
+            ``damaged_file``.
     """
-    file = stem.with_suffix(".json")
+    file, tensor_file = stem.with_suffix(".json"), stem.with_suffix(".safetensors")
     try:
-        words = json.loads(_read(file))
+        metadata = json.loads(_read(file))
     except (ValueError, RecursionError) as error:
-        raise NsmError(f"{file}: not readable as JSON; make the run again") from error
-    if not isinstance(words, dict) or words.get("format") != form:
-        raise NsmError(f"{file}: not of format {form}; give the folder of a run that made one")
-    if words.get("version") != version:
-        raise NsmError(
-            f"{file}: version {words.get('version')}, but this nsm reads version {version}; "
-            "make the run again with this nsm"
+        message = f"{file}: not readable as JSON; make the run again"
+        raise NsmError(message, kind="damaged_file", key=str(file)) from error
+    if not isinstance(metadata, dict) or metadata.get("format") != form:
+        message = f"{file}: not of format {form}; give the folder of a run that made one"
+        raise NsmError(message, kind="wrong_format", key=str(file))
+    version = metadata.get("version")
+    if version not in (1, VERSION):
+        message = (
+            f"{file}: version {version}, but this nsm reads version 1 to {VERSION}; update nsm"
         )
-    # a writing that was cut short has left the tensors of this JSON under the other name
-    short = _is_committed(stem, _previous(stem))
-    data = _read(_previous(stem) if short else stem.with_suffix(".safetensors"))
-    if hashlib.sha256(data).hexdigest() != words.get("sha256"):
+        raise NsmError(message, kind="wrong_version", key=str(file))
+    # an interrupted write has left the tensors of this JSON under the other name
+    data = _read(_previous(stem) if _is_committed(stem, _previous(stem)) else tensor_file)
+    if hashlib.sha256(data).hexdigest() != metadata.get("sha256"):
         raise NsmError(
-            f"{stem.with_suffix('.safetensors')}: truncated or changed (its checksum is not the "
-            f"one in {file.name}); copy the folder or make the run again"
+            f"{tensor_file}: truncated or changed (its checksum is not the one in {file.name}); "
+            "copy the folder or make the run again",
+            kind="damaged_file",
+            key=str(tensor_file),
         )
     try:
         tensors = load(data)
-    except (SafetensorError, *BROKEN) as error:
-        raise misfit(stem, error) from error
-    for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not tensor.isfinite().all():
-            raise misfit(stem, ValueError(f"{name} is not finite"))
-    return tensors, words
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not tensor.isfinite().all():
+                raise ValueError(f"{name} is not finite")
+        return from_version_1(tensors, metadata) if version == 1 else (tensors, metadata)
+    except (SafetensorError, *DAMAGE) as error:
+        raise damaged(stem, error) from error
 
 
-def check_stored(archive: Path) -> None:
-    """ValueError for a checkpoint that may take more memory than its size.
+def check_stored(checkpoint: Path) -> None:
+    """Refuse a checkpoint that may take more memory than its size.
 
-    Its members must be stored as they are, and it must be made of tensors and plain values:
-    what is called while it is read makes no room by numbers that are in it.
+    ``torch.load(weights_only=True)`` runs no code, but it inflates compressed members, and makes
+    room by a number (``bytearray(10**10)``).
+
+    Raises:
+        ValueError: a compressed member, or a call that no checkpoint of ours needs.
     """
-    with zipfile.ZipFile(archive) as members:
+    with zipfile.ZipFile(checkpoint) as members:
         for member in members.infolist():
             if member.compress_type != zipfile.ZIP_STORED:
                 raise ValueError("compressed members")
             if not member.filename.endswith(".pkl"):
                 continue
             for code, argument, _ in pickletools.genops(members.read(member)):
-                named = code.name in _NAMING
-                if named and not (code.name == "GLOBAL" and _CALLED.fullmatch(str(argument))):
+                # torch knows no other opcode that names something
+                if code.name == "GLOBAL" and not _CALLED.fullmatch(str(argument)):
                     raise ValueError(f"{argument} is nothing that a checkpoint needs")
 
 
-def misfit(stem: Path, error: Exception) -> NsmError:
-    """The message for an artefact whose parts do not fit together."""
-    if isinstance(error, NotRegistered):
-        return NsmError(f"{stem}: {error}")
+def damaged(stem: Path, error: Exception) -> NsmError:
+    """The error for an artefact whose parts do not fit together, or whose code is not known."""
+    if isinstance(error, (NotRegistered, NotTrusted)):
+        return NsmError(f"{stem}: {error}", kind=error.kind, key=error.key)
     reason = " ".join(str(error).split())[:120]
-    return NsmError(f"{stem}: its two files do not fit together ({reason}); make the run again")
+    message = f"{stem}: its two files do not fit together ({reason}); make the run again"
+    return NsmError(message, kind="damaged_file", key=str(stem))
 
 
 def _read(file: Path) -> bytes:
     if file.exists() and not file.is_file():  # a pipe would be waited for, a device read for ever
-        raise NsmError(f"{file}: not a regular file; give the folder of a complete run")
+        message = f"{file}: not a regular file; give the folder of a complete run"
+        raise NsmError(message, kind="unreadable_file", key=str(file))
     try:
         return file.read_bytes()
     except OSError as error:
+        kind = "unreadable_file" if file.exists() else "missing_file"
         reason = error.strerror or "cannot be read"
-        raise NsmError(f"{file}: {reason}; give the folder of a complete run") from error
+        message = f"{file}: {reason}; give the folder of a complete run"
+        raise NsmError(message, kind=kind, key=str(file)) from error

@@ -1,4 +1,4 @@
-"""Points and values as users give them: checked before anything is computed from them."""
+"""Checks of the points and values that users give."""
 
 from __future__ import annotations
 
@@ -10,40 +10,51 @@ from torch import Tensor
 from nsm.errors import NsmError
 
 
-def as_points(given: Any, columns: int, what: str) -> np.ndarray:
+def as_points(given: Any, columns: int, name: str) -> np.ndarray:
     """Points (N, columns) as float64.
 
     Raises:
-        NsmError: another shape, what is no real number, NaN or infinity.
+        NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``, with the name as key.
     """
-    points = as_values(given, what, kinds="fiub").astype(np.float64)
+    points = as_values(given, name, kinds="fiub").astype(np.float64)
     if points.ndim != 2 or points.shape[1] != columns:
-        raise NsmError(f"{what}: give an array (N, {columns}), not {points.shape}")
+        message = f"{name}: give an array (N, {columns}), not {points.shape}"
+        raise NsmError(message, kind="wrong_shape", key=name)
     return points
 
 
-def as_values(given: Any, what: str, *, kinds: str = "fiubc") -> np.ndarray:
-    """Numbers of any shape, of the kinds of NumPy's dtypes that are taken.
+def as_values(given: Any, name: str, *, kinds: str = "fiubc") -> np.ndarray:
+    """Numbers of any shape.
+
+    Args:
+        given: an array, a tensor or nested lists.
+        name: of the argument, in messages.
+        kinds: the kinds of NumPy's dtypes that are accepted.
 
     Raises:
-        NsmError: other things than numbers, NaN or infinity.
+        NsmError: ``wrong_type`` or ``not_finite``, with the name as key.
     """
     try:
         values = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
     except (TypeError, ValueError):  # rows of different lengths
-        raise NsmError(f"{what}: not an array of numbers") from None
+        raise NsmError(f"{name}: not an array of numbers", kind="wrong_type", key=name) from None
     if values.dtype.kind not in kinds:
-        raise NsmError(f"{what}: not an array of numbers, but of {values.dtype}")
+        message = f"{name}: not an array of numbers, but of {values.dtype}"
+        raise NsmError(message, kind="wrong_type", key=name)
     if values.dtype.kind in "fc" and not np.isfinite(values).all():
-        raise NsmError(f"{what}: NaN or infinity among them; leave these out")
+        raise NsmError(f"{name}: it has NaN or infinity; remove them", kind="not_finite", key=name)
     return values
 
 
-def check_points(given: Tensor, what: str) -> None:
-    """NsmError unless a tensor is (N, 2), of floating point.
+def check_points(given: Tensor, name: str) -> None:
+    """Refuse a tensor that is not (N, 2) of floating point.
 
-    Its values are not looked at: the GPU would have to be waited for.
+    The values are not looked at, which would wait for the GPU.
+
+    Raises:
+        NsmError: ``wrong_shape``, with the name as key.
     """
     if given.ndim != 2 or given.shape[1] != 2 or not given.is_floating_point():
         shape = tuple(given.shape)
-        raise NsmError(f"{what}: give a tensor (N, 2) of floating point, not {given.dtype} {shape}")
+        message = f"{name}: give a tensor (N, 2) of floating point, not {given.dtype} {shape}"
+        raise NsmError(message, kind="wrong_shape", key=name)

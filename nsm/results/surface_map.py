@@ -1,8 +1,9 @@
-"""Maps between surfaces: where points go, and what they carry along."""
+"""Maps between surfaces, and what they transfer."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
@@ -10,22 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import nn
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
-from nsm.maps import Rotated, build_planar
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired
-from nsm.results.files import BROKEN, misfit, read_pair, write_pair
+from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.networks import network_of
+from nsm.results.networks import rotated_map
 from nsm.results.points import as_points, as_values
 from nsm.surfaces.location import Places, locate
 
 FORMAT = "nsm-surface-map"
-VERSION = 1
 STEM = "pair"
 
 
@@ -33,9 +31,9 @@ STEM = "pair"
 class SurfaceMap:
     """A map f from one surface to another, f∘φ = ψ∘h.
 
-    Points are in the units and place of the mesh files. f is linear on each triangle of the source
-    in the target's domain, so that what is certified at the vertices holds for every point. Values
-    are looked up on the meshes themselves; the networks φ and ψ only served to find h.
+    Points are in the units and place of the mesh files. h is linear on each triangle of the source,
+    so that a certificate of the vertices holds for every point. Points of the surfaces are looked
+    up on the meshes; the networks φ and ψ only served to find h.
 
     Attributes:
         source, target: the neural surfaces φ and ψ.
@@ -43,7 +41,8 @@ class SurfaceMap:
         landmarks: (L, 2) vertices of the two mesh files.
         metrics: figures of :func:`nsm.results.pair_metrics`.
         config: the settings of the run that made it.
-        correction: vertices of the source that :meth:`repaired` moved off h, and where to.
+        correction: vertices of the source that :meth:`repaired` moved, and where to.
+        vertex_image: (V, 2) values of h at the source's vertices, where they are known already.
     """
 
     source: NeuralSurface
@@ -53,6 +52,7 @@ class SurfaceMap:
     metrics: dict[str, float] = field(default_factory=dict, repr=False)
     config: dict[str, Any] = field(default_factory=dict, repr=False)
     correction: Correction = field(default_factory=Correction, repr=False)
+    vertex_image: np.ndarray | None = field(default=None, repr=False)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.
@@ -60,11 +60,11 @@ class SurfaceMap:
         Points off the source start from the nearest point on it.
 
         Raises:
-            NsmError: another shape, NaN or infinity.
+            NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         s, t = self.source.surface, self.target.surface
         points = as_points(points, 3, "points on the source")
-        with np.errstate(over="ignore"):  # what is far beyond all is answered as well
+        with np.errstate(over="ignore"):  # of points far away
             normalised = (points - s.center) * s.scale
         uv = locate(normalised, s.vertices, s.faces).take(s.uv, s.faces)
         return self.target.in_original_units(_lifted(t, self.planar(uv)))
@@ -73,16 +73,22 @@ class SurfaceMap:
         """Points (N, 2) of the source's domain to those of the target's, (N, 2).
 
         Raises:
-            NsmError: another shape, NaN or infinity.
+            NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         s = self.source.surface
         uv = as_points(uv, 2, "points of the domain")
         return locate(uv, s.uv, s.faces).take(self.image_uv, s.faces)
 
     @cached_property
+    def _uncorrected(self) -> np.ndarray:
+        if self.vertex_image is not None:
+            return self.vertex_image
+        return evaluate(self.map, self.source.surface.uv)
+
+    @cached_property
     def image_uv(self) -> np.ndarray:
-        """Where the source's vertices go: (V, 2) in the target's domain; h, but for corrections."""
-        return self.correction.of(evaluate(self.map, self.source.surface.uv))
+        """Images (V, 2) of the source's vertices in the target's domain, with the correction."""
+        return self.correction.of(self._uncorrected)
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
@@ -90,20 +96,17 @@ class SurfaceMap:
         return certificate(self.target.surface.domain, self.image_uv, self.source.surface.faces)
 
     def repaired(self) -> SurfaceMap:
-        """The map with its flipped triangles turned back, and its boundary put in order, where
-        that can be done; landmarks stay if that suffices. Figures are to be measured anew."""
+        """The map with its flipped triangles turned back and its boundary put in order, where
+        possible; landmarks move only if flips remain otherwise. ``metrics`` are not updated."""
         s = self.source.surface
         held = np.isin(s.source_vertex, s.kept(self.landmarks[:, 0].tolist()))
-        better = repaired(s.domain, s.uv, s.faces, self.image_uv, held)
-        result = replace(
-            self, correction=Correction.between(self.image_uv, better, self.correction)
-        )
-        result.__dict__["image_uv"] = better  # inverses take seconds to find again
-        return result
+        better = repaired(self.target.surface.domain, s.uv, s.faces, self.image_uv, held)
+        correction = Correction.between(self.image_uv, better, self.correction)
+        return replace(self, correction=correction, vertex_image=self._uncorrected)
 
     @cached_property
     def image(self) -> np.ndarray:
-        """Where the source's vertices (of the cut mesh) go: (V, 3) on the target, normalised."""
+        """Images (V, 3) of the cut source's vertices on the target, in normalised units."""
         return _lifted(self.target.surface, self.image_uv)
 
     @cached_property
@@ -120,18 +123,18 @@ class SurfaceMap:
         return self._back.take(self.source.surface.uv, self.source.surface.faces)
 
     def transfer(self, values: np.ndarray, *, back: bool = False) -> np.ndarray:
-        """Carry values at the source's vertices over to the target's, or back.
+        """Transfer values at the source's vertices to the target's, or back.
 
         Args:
-            values: (V, ...) a row for each vertex of the mesh file; whole numbers are taken for
-                labels, which are picked instead of interpolated.
+            values: (V, ...) a row for each vertex of the mesh file; integers are labels, which are
+                not interpolated.
             back: from the target to the source.
 
         Returns:
             (W, ...) a row for each vertex of the other mesh file (see :func:`by_file_vertex`).
 
         Raises:
-            NsmError: not a row for each vertex, or other values than finite numbers.
+            NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         start, end = self.source.surface, self.target.surface
         places = self._back
@@ -146,27 +149,28 @@ class SurfaceMap:
         return by_file_vertex(end, moved)
 
     def morph(self, t: float) -> np.ndarray:
-        """Vertices (V, 3) on the straight way from the source (t = 0) to the target (t = 1).
+        """Vertices (V, 3) on straight lines from the source (t = 0) to the target (t = 1).
 
-        Normalised units; the target is first turned and moved to lie best on the source.
+        In normalised units; a rigid motion first aligns the target with the source.
 
         Raises:
-            NsmError: t is not a finite number.
+            NsmError: ``wrong_type``: t is not a finite number.
         """
         if not isinstance(t, Real) or not math.isfinite(t):
-            raise NsmError(f"morph: {t!r} is not a number from 0 to 1")
+            message = f"morph: {t!r} is not a number from 0 to 1"
+            raise NsmError(message, kind="wrong_type", key="t")
         return (1 - t) * self.source.surface.vertices + t * self.aligned_image
 
     @cached_property
     def aligned_image(self) -> np.ndarray:
-        """The image (V, 3), turned and moved (a rigid motion) to lie best on the source."""
+        """The image (V, 3), aligned with the source by a rigid motion."""
         return self.aligned(self.image)
 
     def aligned(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) near the target, normalised, under that rigid motion (Kabsch).
+        """Normalised points (N, 3) near the target, under that rigid motion (Kabsch's algorithm).
 
         Raises:
-            NsmError: another shape, NaN or infinity.
+            NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         points = as_points(points, 3, "points near the target")
         image, reference = self.image, self.source.surface.vertices
@@ -184,47 +188,40 @@ class SurfaceMap:
         place = Path(folder)
         save_surface(place / "source", self.source)
         save_surface(place / "target", self.target)
-        tensors = {k: v.contiguous() for k, v in self.map.state_dict().items()}
-        tensors.update(self.correction.tensors())
-        words = {
+        tensors = {**self.map.state_dict(), **self.correction.tensors()}
+        metadata = {
             "map": self.map.inner.config,  # type: ignore[union-attr]
             "landmarks": self.landmarks.tolist(),
             "metrics": self.metrics,
             "config": self.config,
         }
-        write_pair(place / STEM, FORMAT, VERSION, tensors, words)
+        write_pair(place / STEM, FORMAT, tensors, metadata)
 
 
-def load_surface_map(folder: str | Path) -> SurfaceMap:
+def load_surface_map(folder: str | Path, trust: Iterable[str] = ()) -> SurfaceMap:
     """Read what :meth:`SurfaceMap.save` wrote.
 
-    Raises:
-        NsmError: files that are missing, truncated, damaged, or of another version.
+    Args, Raises:
+        as for :func:`nsm.results.load_surface`.
     """
     place = Path(folder)
-    tensors, words = read_pair(place / STEM, FORMAT, VERSION)
-    source, target = load_surface(place / "source"), load_surface(place / "target")
+    tensors, metadata = read_pair(place / STEM, FORMAT)
+    source, target = (load_surface(place / end, trust) for end in ("source", "target"))
     try:
         correction = Correction.taken(tensors, len(source.surface.vertices))
-        h = network_of(rotated_planar, words["map"], tensors)
-        landmarks = np.array(words["landmarks"], dtype=np.int64).reshape(-1, 2)
-        metrics, config = dict(words["metrics"]), dict(words["config"])
-    except BROKEN as error:
-        raise misfit(place / STEM, error) from error
-    h.eval().requires_grad_(False)
+        h = rotated_map(metadata["map"], tensors, trust)
+        landmarks = np.array(metadata["landmarks"], dtype=np.int64).reshape(-1, 2)
+        metrics, config = dict(metadata["metrics"]), dict(metadata["config"])
+    except DAMAGE as error:
+        raise damaged(place / STEM, error) from error
     return SurfaceMap(source, target, h, landmarks, metrics, config, correction)
-
-
-def rotated_planar(config: dict[str, Any]) -> Rotated:
-    """The planar map of a configuration, its input turned by a rotation that is still to come."""
-    return Rotated(build_planar(config), torch.eye(2, device="cpu"))
 
 
 def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
     """Values at the cut mesh's vertices (V, ...) as values at the mesh file's (W, ...).
 
-    Of a seam vertex the first copy counts, of a merged one what it was merged with; a vertex of
-    the file that is not on the surface has the value of the one with the nearest number that is.
+    A seam vertex takes the value of its first copy, a merged vertex that of the vertex it was
+    merged with, and a vertex that is not on the surface that of the one with the nearest number.
     """
     row = surface.cut_vertex
     present = np.flatnonzero(row >= 0)
@@ -235,15 +232,16 @@ def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
 def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
     """Values at the mesh file's vertices (W, ...) as values at the cut mesh's (V, ...).
 
-    Vertices that were inserted between others get what these have: the mean, or a label.
+    Vertices that were inserted between others take the mean of their neighbours, or a label of one.
 
     Raises:
-        NsmError: not a row for each vertex of the file.
+        NsmError: ``wrong_shape``: not a row for each vertex of the file.
     """
     needed = len(surface.cut_vertex)
     if values.ndim == 0 or len(values) != needed:
         rows = 0 if values.ndim == 0 else len(values)
-        raise NsmError(f"{surface.name} has {needed} vertices, but {rows} rows were given")
+        message = f"{surface.name} has {needed} vertices, but {rows} rows were given"
+        raise NsmError(message, kind="wrong_shape", key=surface.name)
     result = values[np.maximum(surface.source_vertex, 0)]
     inserted = np.flatnonzero(surface.source_vertex < 0)
     whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool

@@ -326,10 +326,10 @@ def test_an_artefact_written_over_another_is_the_one_or_the_other(tmp_path, call
     stem = tmp_path / "surface"
 
     def write(value):
-        write_pair(stem, "f", 1, {"x": torch.full((3,), float(value))}, {"value": value})
+        write_pair(stem, "f", {"x": torch.full((3,), float(value))}, {"value": value})
 
     def read():
-        tensors, words = read_pair(stem, "f", 1)
+        tensors, words = read_pair(stem, "f")
         assert (tensors["x"] == words["value"]).all()
         return words["value"]
 

@@ -12,7 +12,8 @@ from torch import nn
 from nsm.domains import Surface
 from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
-from nsm.maps import build_map
+from nsm.maps import NeuralMap
+from nsm.maps.encodings import RandomFourierFeatures
 from nsm.results import (
     NeuralSurface,
     atomic_write,
@@ -106,7 +107,7 @@ def test_the_seam_gap_is_the_distance_of_twins():
 @pytest.fixture
 def neural() -> NeuralSurface:
     torch.manual_seed(0)
-    network = build_map({"width": 16, "depth": 1, "encoding": {"name": "fourier", "features": 8}})
+    network = NeuralMap(width=16, depth=1, encoding=RandomFourierFeatures(features=8))
     return NeuralSurface(square([(0, 5)]), network, {"rms_percent": 1.5}, {"seed": 3})
 
 

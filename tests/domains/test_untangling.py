@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from thorough import examples
 
-from nsm.domains.untangling import flipped, in_order, order_violations, untangled
+from nsm.domains import domain
+from nsm.domains.planar_mesh import flipped, order_violations
+from nsm.domains.untangling import untangled
 from nsm.surfaces.predicates import orientation
 from nsm.surfaces.shapes import grid_mesh, ring_mesh
 from nsm.surfaces.topology import boundary_loops
@@ -103,19 +105,18 @@ def test_what_cannot_be_untangled_is_given_back_for_the_caller_to_count():
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.15), st.sampled_from(["disc", "square"]))
 @examples(50)
-def test_a_boundary_is_put_in_order_along_the_domain(seed, size, domain):
-    random = np.random.default_rng(seed)
+def test_a_boundary_is_put_in_order_along_the_domain(seed, size, name):
+    random, omega = np.random.default_rng(seed), domain(name)
     t = np.arange(40) / 40
-    from nsm.domains.base import at_fractions, fractions_of
-
-    rest = at_fractions(t, domain)
-    jumbled = at_fractions(np.mod(t + 0.3 + size * (random.random(40) - 0.5), 1), domain)
-    result = in_order(jumbled, rest, domain)
-    steps = np.mod(np.diff(fractions_of(result, domain), append=fractions_of(result, domain)[0]), 1)
+    rest = omega.boundary_points(t)
+    jumbled = omega.boundary_points(np.mod(t + 0.3 + size * (random.random(40) - 0.5), 1))
+    result = omega.in_order(jumbled, rest)
+    fractions = omega.boundary_fractions(result)
+    steps = np.mod(np.diff(fractions, append=fractions[0]), 1)
     assert (steps > 0).all() and steps.sum() == pytest.approx(1)
     if order_violations(jumbled) == 0:
         assert (result == jumbled).all()
-    if domain == "disc":
+    if name == "disc":
         assert order_violations(result) == 0
     # no point goes farther than the jumble went
     assert np.linalg.norm(result - jumbled, axis=1).max() <= 8 * size + 1e-9

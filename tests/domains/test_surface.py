@@ -8,20 +8,19 @@ from functools import partial
 import igl
 import numpy as np
 import pytest
+import torch
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from thorough import examples
 
-from nsm.domains.planar_mesh import (
-    boundary_self_intersections,
-    flipped_triangles,
-    symmetric_dirichlet_per_face,
-)
+from nsm.domains import Surface
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.tutte import tutte
 from nsm.errors import NsmError
-from nsm.surfaces import Surface, cache, catalogue, catalogue_names, topology
+from nsm.surfaces import cache, catalogue, catalogue_names, topology
 from nsm.surfaces.catalogue import catalogue_mesh
+from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.loading import load_mesh
 
 SHAPES = ["plane", "hemisphere", "sphere", "torus", "cylinder", "cone", "saddle", "terrain"]
@@ -57,19 +56,18 @@ def check(surface: Surface) -> None:
     assert flipped_triangles(surface.uv, surface.faces) == 0
     loop = topology.boundary_loops(surface.faces)[0]
     assert boundary_self_intersections(surface.uv, loop) == 0
-    order = 2 if surface.domain == "disc" else np.inf
-    radius = np.linalg.norm(surface.uv, ord=order, axis=1)
-    assert np.allclose(radius[loop], 1, atol=1e-12)
-    assert radius.max() <= 1 + 1e-12
+    distance = surface.domain.signed_distance(torch.from_numpy(surface.uv)).numpy()
+    assert np.abs(distance[loop]).max() <= 1e-12
+    assert distance.max() <= 1e-12
     area = topology.face_areas(surface.vertices, surface.faces).sum()
-    assert area == pytest.approx(np.pi if surface.domain == "disc" else 4)
+    assert area == pytest.approx(surface.domain.area)
     a, b = surface.seam_pairs.T
     assert np.array_equal(surface.vertices[a], surface.vertices[b])
     assert set(surface.seam_pairs.ravel()) <= set(loop)
     assert surface.quality["flipped_triangles"] == 0
     known = surface.source_vertex >= 0
     assert len(surface.source_vertex) == len(surface.vertices)
-    # each seam vertex has a twin; other copies are those of vertices where faces only touched
+    # each seam vertex has a second copy; more copies come where faces only touched
     _, count = np.unique(surface.source_vertex[known], return_counts=True)
     if any("touch at a point" in line for line in surface.log):
         assert len(surface.seam_pairs) <= (count - 1).sum()
@@ -78,7 +76,7 @@ def check(surface: Surface) -> None:
 
 
 def mean_energy(surface: Surface) -> float:
-    value = symmetric_dirichlet_per_face(surface.vertices, surface.faces, surface.uv, eps=0.0)
+    value = triangle_distortion(surface.uv, surface.vertices, surface.faces, eps=0.0)
     return float(np.average(value, weights=topology.face_areas(surface.vertices, surface.faces)))
 
 
@@ -172,22 +170,28 @@ def test_symmetric_dirichlet_of_known_maps():
     for s, t in ((1, 1), (2, 0.5), (3, 1)):
         vertices = np.column_stack([uv * [s, t], np.zeros(3)])
         expected = s**2 + t**2 + 1 / (s**2 + 0.01) + 1 / (t**2 + 0.01)
-        assert symmetric_dirichlet_per_face(vertices, faces, uv) == pytest.approx(expected)
+        assert triangle_distortion(uv, vertices, faces) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "kind", "key"),
     [
-        ({"domain": "circle"}, "domain"),
-        ({"parameterization": "lscm"}, "parameterization"),
-        ({"seam_vertices": [0, 10**6]}, "seam vertex"),
-        ({"seam_vertices": [7, 7]}, "two different"),
+        ({"domain": "circle"}, "unknown_option", "domain"),
+        ({"domain": 3}, "wrong_type", "domain"),
+        ({"parameterization": "lscm"}, "unknown_option", "parameterization"),
+        ({"seam_vertices": [0, 10**6]}, "not_on_surface", "seam_vertices"),
     ],
 )
-def test_options_that_cannot_be_met(options, words):
+def test_options_that_cannot_be_met(options, kind, key):
     vertices, faces = catalogue_mesh("sphere")
-    with pytest.raises(NsmError, match=words):
+    with pytest.raises(NsmError) as error:
         Surface.from_arrays(vertices, faces, **options)
+    assert (error.value.kind, error.value.key) == (kind, key)
+
+
+def test_a_closed_shape_needs_two_seam_vertices():
+    with pytest.raises(NsmError):
+        Surface.from_arrays(*catalogue_mesh("sphere"), seam_vertices=[7, 7])
 
 
 def test_preimages_are_uv_of_file_vertices():
@@ -197,8 +201,9 @@ def test_preimages_are_uv_of_file_vertices():
         at = np.flatnonzero((surface.uv == uv).all(axis=1))
         assert surface.source_vertex[at[0]] == vertex
     for bad in (-1, len(vertices)):
-        with pytest.raises(NsmError, match="not on the surface"):
+        with pytest.raises(NsmError) as error:
             surface.preimages([bad])
+        assert error.value.kind == "not_on_surface"
 
 
 # ---------------------------------------------------------------- repairs

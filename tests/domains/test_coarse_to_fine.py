@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
+import torch
 
-from nsm.domains.base import boundary_positions
+from nsm.domains import Disc, Surface, domain, embedding
 from nsm.domains.coarse_to_fine import laid_out
 from nsm.domains.decimation import Rings, coarsen, present_faces, undo
-from nsm.domains.planar_mesh import (
-    boundary_self_intersections,
-    flipped_triangles,
-    symmetric_dirichlet_per_face,
-)
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.tutte import tutte
-from nsm.domains.vertex_relaxation import Slopes, Stars, relax
-from nsm.surfaces import Surface, parameterization, shapes, topology
+from nsm.domains.vertex_relaxation import Freedom, Stars, relax
+from nsm.surfaces import shapes, topology
+from nsm.surfaces.geometry import triangle_distortion
 
 
 def bumpy(n: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -33,9 +31,9 @@ def test_rounds_leave_discs_and_are_undone():
     assert held[coarse].sum() >= 3
     assert not held[np.concatenate([r.vertex for r in rounds])].any()
     edges = topology.edges_of(coarse)
-    rim = np.zeros(len(vertices), dtype=bool)
-    rim[edges.pairs[edges.count == 1]] = True
-    assert not (rim[edges.pairs].all(axis=1) & (edges.count == 2)).any()  # no chords
+    on_boundary = np.zeros(len(vertices), dtype=bool)
+    on_boundary[edges.pairs[edges.count == 1]] = True
+    assert not (on_boundary[edges.pairs].all(axis=1) & (edges.count == 2)).any()  # no chords
     for step in reversed(rounds):
         undo(current, step)
     assert np.array_equal(current, faces)
@@ -53,12 +51,12 @@ def test_vertices_of_a_set_are_apart():
 def test_derivatives_of_a_star():
     vertices, faces = bumpy(12)
     loop = topology.boundary_loops(faces)[0]
-    uv = tutte(vertices, faces, loop, boundary_positions(vertices, loop, "disc"))
+    uv = tutte(vertices, faces, loop, Disc().place_boundary(vertices, loop))
     face, k = np.nonzero(faces == 5 * 12 + 5)
     b, c = faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]
     star = Stars.of(vertices, np.array([65]), np.zeros(len(face), dtype=np.int64), b, c)
     energy, gradient, second = star.derivatives(uv)
-    value = symmetric_dirichlet_per_face(vertices, faces, uv, eps=0.0)[face]
+    value = triangle_distortion(uv, vertices, faces, eps=0.0)[face]
     area = topology.face_areas(vertices, faces)[face]
     assert energy[0] == pytest.approx((value * area).sum())
     step = 1e-6 * np.eye(2)
@@ -76,21 +74,21 @@ def test_derivatives_of_a_star():
 def test_a_step_lowers_the_energy_and_keeps_to_the_boundary():
     vertices, faces = bumpy(12)
     loop = topology.boundary_loops(faces)[0]
-    uv = tutte(vertices, faces, loop, boundary_positions(vertices, loop, "disc"))
-    rim = np.zeros(len(vertices), dtype=bool)
-    rim[loop] = True
+    uv = tutte(vertices, faces, loop, Disc().place_boundary(vertices, loop))
+    on_boundary = np.zeros(len(vertices), dtype=bool)
+    on_boundary[loop] = True
     held = np.zeros(len(vertices), dtype=bool)
     vertex = loop[3]
     face, k = np.nonzero(faces == vertex)
     b, c = faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]
     star = Stars.of(vertices, np.array([vertex]), np.zeros(len(face), dtype=np.int64), b, c)
     before, place = star.energy(uv, uv[[vertex]]), uv[vertex].copy()
-    relax(uv, star, Slopes(rim, held, "disc"))
+    relax(uv, star, Freedom(on_boundary, held, Disc()))
     assert star.energy(uv, uv[[vertex]]) < before
     assert not np.array_equal(uv[vertex], place)
     assert np.linalg.norm(uv[vertex]) == pytest.approx(1, abs=1e-12)
     held[vertex], place = True, uv[vertex].copy()
-    relax(uv, star, Slopes(rim, held, "disc"))
+    relax(uv, star, Freedom(on_boundary, held, Disc()))
     assert np.array_equal(uv[vertex], place)
 
 
@@ -99,32 +97,32 @@ def test_a_bad_start_is_put_back_without_flips():
     vertices, faces = shapes.cone(40, height=4.0)
     vertices = vertices * np.sqrt(np.pi / topology.face_areas(vertices, faces).sum())
     loop = topology.boundary_loops(faces)[0]
-    boundary = boundary_positions(vertices, loop, "disc")
+    boundary = Disc().place_boundary(vertices, loop)
     none = np.zeros(len(vertices), dtype=bool)
     uv = laid_out(
-        vertices, faces, loop, boundary, "disc", none, lambda v, f, r, b, h: tutte(v, f, r, b), 300
+        vertices, faces, loop, boundary, Disc(), none, lambda v, f, r, b, h: tutte(v, f, r, b), 300
     )
     assert uv is not None
     assert flipped_triangles(uv, faces) == 0
 
 
-@pytest.mark.parametrize("domain", ["disc", "square"])
-def test_as_good_as_at_once(domain, monkeypatch):
+@pytest.mark.parametrize("name", ["disc", "square"])
+def test_as_good_as_at_once(name, monkeypatch):
     vertices, faces = shapes.sphere(3)
     vertices = vertices * (1 + 0.2 * np.sin(3 * vertices[:, :1]) * np.cos(4 * vertices[:, 1:2]))
-    at_once = Surface.from_arrays(vertices, faces, domain=domain)
-    monkeypatch.setattr(parameterization, "LARGE", 1000)
-    monkeypatch.setattr(parameterization, "COARSE", 500)
+    at_once = Surface.from_arrays(vertices, faces, domain=name)
+    monkeypatch.setattr(embedding, "LARGE", 1000)
+    monkeypatch.setattr(embedding, "COARSE", 500)
     calls = []
-    solver = parameterization.slide
-    monkeypatch.setattr(parameterization, "slide", lambda *a: calls.append(len(a[1])) or solver(*a))
-    surface = Surface.from_arrays(vertices, faces, domain=domain)
+    solver = embedding.slide
+    monkeypatch.setattr(embedding, "slide", lambda *a: calls.append(len(a[1])) or solver(*a))
+    surface = Surface.from_arrays(vertices, faces, domain=name)
     assert calls and max(calls) <= 500
     assert flipped_triangles(surface.uv, surface.faces) == 0
     loop = topology.boundary_loops(surface.faces)[0]
     assert boundary_self_intersections(surface.uv, loop) == 0
-    order = 2 if domain == "disc" else np.inf
-    assert np.allclose(np.linalg.norm(surface.uv[loop], ord=order, axis=1), 1, atol=1e-12)
+    distance = domain(name).signed_distance(torch.from_numpy(surface.uv[loop]))
+    assert distance.abs().max() <= 1e-12
     assert (
         surface.quality["median_symmetric_dirichlet"]
         <= 1.01 * at_once.quality["median_symmetric_dirichlet"]
@@ -132,8 +130,8 @@ def test_as_good_as_at_once(domain, monkeypatch):
 
 
 def test_what_does_not_carry_over_is_laid_out_at_once(monkeypatch):
-    monkeypatch.setattr(parameterization, "LARGE", 500)
-    monkeypatch.setattr(parameterization, "laid_out", lambda *_: None)
+    monkeypatch.setattr(embedding, "LARGE", 500)
+    monkeypatch.setattr(embedding, "laid_out", lambda *_: None)
     vertices, faces = bumpy(20)
     surface = Surface.from_arrays(vertices, faces)
     assert any("laid out at once" in line for line in surface.log)
