@@ -69,13 +69,24 @@ def made_with(config: Mapping[str, Any], **offered: Any) -> Any:
     """
     target = str(config["_target_"])
     factory = made({**config, "_partial_": True})
-    names = inspect.signature(factory.func).parameters
+    names = _accepted(factory.func)
     given = {key: value for key, value in offered.items() if key in names and key not in config}
     try:
         return factory(**given)
     except (ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise NsmError(f"{target}: {reason}", kind="not_instantiable", key=target) from error
+
+
+def _accepted(target: Any) -> set[str]:
+    """Names of a target's parameters, with those of its bases where it takes ``**kwargs``."""
+    names: set[str] = set()
+    for kind in target.__mro__ if inspect.isclass(target) else (target,):
+        parameters = inspect.signature(kind.__init__ if inspect.isclass(kind) else kind).parameters
+        names |= set(parameters)
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            break
+    return names
 
 
 def is_trusted(target: str, trust: Iterable[str] = ()) -> bool:

@@ -17,6 +17,7 @@ import pytorch_lightning as pl
 from rich.console import Console
 
 from nsm.data import EnsembleData, SurfaceData
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.instantiation import made, target_of
 from nsm.maps.networks import SKIPS
@@ -29,7 +30,6 @@ from nsm.pipeline.training import Run, plain, trained
 from nsm.plugins import import_here
 from nsm.results.callbacks import Pictures
 from nsm.results.loggers import WandB
-from nsm.domains import Surface
 from nsm.sweeps import is_complete
 from nsm.tasks import Overfit, OverfitEnsemble
 from nsm.tasks.ensemble import EnsembleSplit

@@ -11,6 +11,7 @@ import pytorch_lightning as pl
 import torch
 
 from nsm.data import CollectionData, SurfaceData
+from nsm.domains.joint_preparation import Matched, matched_landmarks
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.pipeline.resolve_inputs import landmark_vertices, neural_surfaces, read_shape
@@ -28,7 +29,6 @@ from nsm.results import (
     transfer_matrix_picture,
 )
 from nsm.results.metrics import evaluate
-from nsm.domains.joint_preparation import Matched, matched_landmarks
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -93,8 +93,8 @@ class CollectionMapTask(Task):
     def title(self) -> str:
         return f"{self.name} of {len(self.phis)} surfaces"
 
-    def build(self) -> CollectionMap:
-        return CollectionMap(
+    def build(self) -> Any:
+        return self.module(
             **self.map_settings(),
             points=self.points,
             targets=self.targets,

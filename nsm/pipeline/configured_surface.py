@@ -7,8 +7,7 @@ import os
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.domains import domain
-from nsm.domains import Surface
+from nsm.domains import Surface, domain
 
 
 def configured_surface(config: DictConfig) -> Surface:

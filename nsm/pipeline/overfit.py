@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from nsm.data import SurfaceData
+from nsm.domains import Surface
 from nsm.pipeline.configured_surface import configured_surface, report_surface
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
@@ -20,7 +21,6 @@ from nsm.results import (
     overfit_metrics,
     reconstruction_image,
 )
-from nsm.domains import Surface
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 
@@ -46,12 +46,12 @@ class OverfitTask(Task):
         """Take the prepared surface."""
         self.surface = surface
 
-    def build(self) -> Overfit:
+    def build(self) -> Any:
         surface = self.surface
-        module = Overfit(**self.shared_settings(), diagonal=surface.bounding_box_diagonal)
+        module = self.module(**self.shared_settings(), diagonal=surface.bounding_box_diagonal)
         if self.start is not None:
             module.load_state_dict(self.start.state_dict())
-        elif self.config.map.linear_skip == "fitted":
+        elif self.config.map.get("linear_skip") == "fitted":
             fit_linear_skip(module.map, surface, seed=self.config.seed)
         return module
 

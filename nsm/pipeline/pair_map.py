@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from nsm.data import SurfaceData
+from nsm.domains.joint_preparation import matched_landmarks
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
@@ -32,7 +33,6 @@ from nsm.results import (
     transfer_picture,
 )
 from nsm.results.metrics import evaluate
-from nsm.domains.joint_preparation import matched_landmarks
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -71,7 +71,7 @@ class PairMapTask(Task):
     def title(self) -> str:
         return f"{self.name} {self.surface.name} → {self.psi.surface.name}"
 
-    def build(self) -> PairMap:
+    def build(self) -> Any:
         source, target = self.surface, self.psi.surface
         # where the seams correspond, both sides of the source's should go to one curve
         same_seam = len(target.seam_pairs) and self.matched.on_boundary >= 2
@@ -89,7 +89,7 @@ class PairMapTask(Task):
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
             corners = torch.from_numpy(self.domain.corners).to(p)
             p, q = torch.cat([p, corners]), torch.cat([q, corners @ rotation.T])
-        return PairMap(
+        return self.module(
             **self.map_settings(),
             points=p,
             targets=q,

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from nsm.data import SurfaceData
+from nsm.domains.baselines import BASELINES
 from nsm.pipeline.surface_cache import neural_surface
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
@@ -21,7 +22,6 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
-from nsm.domains.baselines import BASELINES
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 
@@ -41,7 +41,7 @@ class ParamTask(Task):
         """Take the neural surface."""
         self.phi, self.surface = phi, phi.surface
 
-    def build(self) -> Param:
+    def build(self) -> Any:
         surface = self.surface
         areas = face_areas(surface.vertices, surface.faces)
         mesh = (
@@ -49,7 +49,7 @@ class ParamTask(Task):
             torch.as_tensor(surface.faces),
             torch.as_tensor(areas, dtype=torch.float32),
         )
-        return Param(**self.map_settings(), mesh=mesh, phi=self.phi.map)
+        return self.module(**self.map_settings(), mesh=mesh, phi=self.phi.map)
 
     def make_result(self, module: Any) -> Parameterization:
         return Parameterization(self.phi, frozen(module.map), {}, self.settings)

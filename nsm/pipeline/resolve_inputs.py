@@ -12,13 +12,13 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Domain, domain
+from nsm.domains.joint_preparation import Mesh, prepare_jointly
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
 from nsm.pipeline.configured_surface import report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.domains.joint_preparation import Mesh, prepare_jointly
 from nsm.surfaces.landmarks import (
     Landmarks,
     as_lists,

@@ -172,7 +172,7 @@ def finish(
     }
     atomic_write(run.folder / "metrics.json", as_json(words))
     if task.table is not None:
-        task.console.print(type(task).table(result.metrics))  # type: ignore[misc]
+        task.console.print(task.table(result.metrics))
     if not is_passing(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from nsm.config import compose_config
-from nsm.domains import domain
+from nsm.domains import Surface, domain
 from nsm.errors import NsmError
 from nsm.maps.networks import SKIPS
 from nsm.pipeline.batched import common_settings, member, overfit_ensemble
@@ -26,7 +26,6 @@ from nsm.pipeline.runner import finish, run_prepared
 from nsm.pipeline.training import Run, accelerator_of, plain
 from nsm.results import NeuralSurface, load_surface
 from nsm.run_directories import passing_folder
-from nsm.domains import Surface
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit

@@ -15,10 +15,9 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.domains import Domain, domain
+from nsm.domains import Surface, domain
 from nsm.instantiation import made, made_with
 from nsm.pipeline.training import plain
-from nsm.domains import Surface
 from nsm.tasks.training import Training
 
 
@@ -73,10 +72,10 @@ class Task:
     result: ClassVar[type]
     defaults: ClassVar[str]
     certified: ClassVar[bool] = False
-    table: ClassVar[Callable[[Any], Any] | None] = None
+    table: ClassVar[Callable[..., Any] | None] = None
     picture_name: ClassVar[str] = "surface"
     config: DictConfig
-    domain: Domain
+    domain: Any  # nsm.domains.Domain; maps need more of it than a domain without boundary has
     console: Console
     surface: Surface
 

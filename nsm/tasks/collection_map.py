@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import At, first_fundamental_form, injectivity
+from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import Rotated, batched
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
-from nsm.tasks.terms import Distortion, Evaluation
+from nsm.tasks.terms import Distortion, Evaluation, Term
 
 # The terms of four surfaces are added up; those of k surfaces are scaled to that many. The default
 # weights were measured with four surfaces.
@@ -108,7 +108,7 @@ class CollectionMap(ConstrainedMap):
             + w.triangles * U
             + w.landmarks * C
         )
-        terms = {
+        terms: dict[str, Term] = {
             **distortion.terms,
             "multipliers": (scale, multipliers),
             "injectivity": (scale * w.injectivity, G),
@@ -133,7 +133,7 @@ class CollectionMap(ConstrainedMap):
         area = torch.linalg.det(forms.detach()).clamp(min=0).sqrt()
         share = area / area.mean(dim=0).clamp(min=1e-12)
         if not self.exact:  # samples that a map sends out of Ω do not count
-            share = share * (self.domain.signed_distance(images.detach()) <= 0).all(dim=0)
+            share = share * inside(self.domain, images.detach()).all(dim=0)
         i, j = self.ordered
         parts = self.energy.parts(forms[i], forms[j], At(images[i], positions[i]))
         evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
@@ -151,9 +151,9 @@ class CollectionMap(ConstrainedMap):
     def _boundary_term(self, images: Tensor) -> Tensor:
         """Σ over surfaces of the mean squared distance of h(∂Ω) to ∂Ω, and of samples outside Ω to
         Ω."""
-        stray = self.domain.signed_distance(images).clamp(min=0) ** 2
-        off = self.domain.signed_distance(self(self.boundary_samples)) ** 2
-        return off.mean(dim=1).sum() + stray.mean(dim=1).sum()
+        stray = outside(self.domain, images).mean(dim=1).sum()
+        off = boundary(self.domain, self(self.boundary_samples)).mean(dim=1).sum()
+        return off + stray
 
     def _seam_gap(self) -> Tensor:
         """Σ over surfaces of the mean squared distance between a seam point's two copies."""

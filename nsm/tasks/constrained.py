@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nsm.energies import landmark
+from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
 from nsm.tasks.fold_barrier import further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
@@ -117,7 +117,6 @@ class ConstrainedMap(Training):
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:
         """Log held-out figures: distortion, folds, and samples outside Ω."""
-        assert evaluation.determinant is not None
         determinant, images = evaluation.determinant, evaluation.image
         count = determinant.shape[-1]
         self.held_out.add(distortion)
@@ -125,8 +124,8 @@ class ConstrainedMap(Training):
         folded = 100 * (determinant <= 0).double().mean()
         self.log("val/folded_percent", folded, batch_size=count)
         if self.domain.has_boundary:
-            stray = 100 * (self.domain.signed_distance(images) > _ON_BOUNDARY).double().mean()
-            self.log("val/outside_percent", stray, batch_size=count)
+            stray = ~inside(self.domain, images, tolerance=_ON_BOUNDARY)
+            self.log("val/outside_percent", 100 * stray.double().mean(), batch_size=count)
 
     def on_validation_epoch_end(self) -> None:
         self.log("val/distortion_median", self.held_out.median())

@@ -12,7 +12,7 @@ from nsm.energies import first_fundamental_form
 from nsm.energies.overfit import normal, position
 from nsm.maps.networks import build_network
 from nsm.settings import OverfitWeights
-from nsm.tasks.terms import Evaluation, made_terms
+from nsm.tasks.terms import Evaluation, Term, made_terms
 from nsm.tasks.training import Training
 
 
@@ -62,7 +62,7 @@ class Overfit(Training):
         N = 0.0 if jacobian is None else normal(jacobian, batch.normals).mean()
 
         loss = P + w.normal * N
-        terms = {"position": (1.0, P), "normal": (w.normal, N)}
+        terms: dict[str, Term] = {"position": (1.0, P), "normal": (w.normal, N)}
         for name, term in self.loss_terms.items():
             B = None if jacobian is None else first_fundamental_form(jacobian)
             terms[name] = (term.weight, term(Evaluation(batch.uv, batch.points, phi, target=B)))

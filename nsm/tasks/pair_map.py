@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import At, first_fundamental_form, injectivity
+from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import Composition, Rotated
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
-from nsm.tasks.terms import Distortion, Evaluation
+from nsm.tasks.terms import Distortion, Evaluation, Term
 
 
 class PairMap(ConstrainedMap):
@@ -96,7 +96,7 @@ class PairMap(ConstrainedMap):
             + w.triangles * U
             + w.landmarks * C
         )
-        terms = {
+        terms: dict[str, Term] = {
             **distortion.terms,
             "multipliers": (1.0, multipliers),
             "injectivity": (w.injectivity, G),
@@ -116,8 +116,8 @@ class PairMap(ConstrainedMap):
         A, B, jacobian, h = self.pointwise(self._at, batch.uv)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         if not self.exact:  # samples that h maps out of Ω do not count
-            inside = self.domain.signed_distance(h) <= 0
-            parts = {name: part[inside] for name, part in parts.items()}
+            kept = inside(self.domain, h)
+            parts = {name: part[kept] for name, part in parts.items()}
         det = torch.linalg.det(jacobian)
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
@@ -131,9 +131,8 @@ class PairMap(ConstrainedMap):
 
     def _boundary_term(self, image: Tensor) -> Tensor:
         """Mean squared distance of h(∂Ω) to ∂Ω, and of samples outside Ω to Ω."""
-        stray = self.domain.signed_distance(image).clamp(min=0) ** 2
-        off = self.domain.signed_distance(self.map(self.boundary_samples)) ** 2
-        return off.mean() + stray.mean()
+        stray = outside(self.domain, image).mean()
+        return boundary(self.domain, self.map(self.boundary_samples)).mean() + stray
 
     def _seam_gap(self) -> Tensor:
         """Mean squared distance on the target between the images of a seam point's two copies."""

@@ -12,7 +12,7 @@ from nsm.energies import At, first_fundamental_form, injectivity
 from nsm.settings import ParamConstraints, ParamWeights
 from nsm.tasks.fold_barrier import FoldBarrier, further_training, stronger
 from nsm.tasks.planar import planar_map
-from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
+from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
 from nsm.tasks.training import Training
 
 
@@ -80,7 +80,7 @@ class Param(Training):
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
 
         loss = energy + w.injectivity * G + w.triangles * U
-        terms = {
+        terms: dict[str, Term] = {
             **distortion.terms,
             "injectivity": (w.injectivity, G),
             "triangles": (w.triangles, U),
@@ -113,7 +113,7 @@ class Param(Training):
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         distortion, evaluation = self._evaluated(batch)
-        folded = 100 * (evaluation.determinant <= 0).double().mean()  # type: ignore[operator]
+        folded = 100 * (evaluation.determinant <= 0).double().mean()
         self.held_out.add(distortion)
         self.log("val/distortion", distortion.mean, batch_size=len(batch.uv))
         self.log("val/folded_percent", folded, batch_size=len(batch.uv))

@@ -35,7 +35,7 @@ class Evaluation:
     image: Tensor
     source: Tensor | None = None
     target: Tensor | None = None
-    determinant: Tensor | None = None
+    determinant: Tensor = None  # type: ignore[assignment]
 
 
 class LossTerm(nn.Module):

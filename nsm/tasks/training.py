@@ -28,6 +28,8 @@ class Training(Microbatching):
     Weights: ClassVar[type]
     Constraints: ClassVar[type | None] = None
     progress_figure, progress_form = "val/distortion", "distortion {:.3f}"
+    map: Any
+    loss_terms: Any  # ModuleDict of nsm.tasks.terms.LossTerm
     log_every = 1
     compiled: Compiled | None = None
 
@@ -66,4 +68,4 @@ class Training(Microbatching):
         self.log_dict(dict(figures), batch_size=batch_size)
 
     def configure_optimizers(self) -> Any:
-        return configure(self.map, self.hparams)  # type: ignore[arg-type]
+        return configure(self.map, self.hparams)
