@@ -1,4 +1,4 @@
-"""What mkdocs does not do by itself: pages made of README.md and conf/, and the navigation."""
+"""What mkdocs lacks: the pages generated from README.md and the configuration; the navigation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
-from nsm.config_docs import Group, Setting, groups, ungrouped  # noqa: E402
+from nsm.config import composed  # noqa: E402
+from nsm.config_docs import (  # noqa: E402
+    Group,
+    Setting,
+    groups,
+    option_settings,
+    plain_settings,
+)
 
 FIRST = ("tutorial.md", "extending.md")
 REFERENCE = ("settings.md", "api.md")
@@ -80,27 +87,29 @@ def settings_page() -> str:
     """The reference of all groups, options and settings, as `nsm --help` has them."""
     parts = [
         "# Settings",
-        "Made of the files of `conf/`, as `nsm --help` is. `GROUP=OPTION` chooses an option of a "
-        "group, `SETTING=VALUE` replaces a setting, `+SETTING=VALUE` adds one that the chosen "
-        "option leaves out.",
+        "`GROUP=OPTION` chooses an option of a group, `SETTING=VALUE` sets a setting. What stands "
+        "under an option are the parameters of the class that its `_target_` names; "
+        "`GROUP._target_=MODULE.CLASS` chooses another class, also one of yours "
+        "([Extending](extending.md)). `nsm --help NAME` shows the same in the terminal.",
         *map(_group, groups()),
         "## Outside the groups",
-        _table(ungrouped()),
+        "The values are those of a run without further settings; tasks and experiments set others.",
+        _table(plain_settings(composed()[0])),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def _group(group: Group) -> str:
     default = f"By default `{group.name}={group.default}`." if group.default != "null" else ""
-    parts = [f"## {group.name}", f"{_text(group.remark[:1].upper() + group.remark[1:])}."]
-    parts += [default] if default else []
-    for option in group.options:
-        parts += [f"### {group.name}={option.name}", _text(option.remark)]
-        parts += [_table(option.settings)] if option.settings else []
+    parts = [f"## {group.name}", f"{_text(group.remark[:1].upper() + group.remark[1:])}.", default]
+    for option, remark in group.options.items():
+        settings = option_settings(group.name, option)
+        parts += [f"### {group.name}={option}", _text(remark)]
+        parts += [_table(settings)] if settings else []
     return "\n\n".join(part for part in parts if part)
 
 
-def _table(settings: tuple[Setting, ...]) -> str:
+def _table(settings: list[Setting]) -> str:
     rows = [f"| `{s.key}` | {_code(s.value)} | {_text(s.remark)} |" for s in settings]
     return "\n".join(["| setting | value | |", "|---|---|---|", *rows])
 
@@ -110,11 +119,11 @@ def _code(value: str) -> str:
 
 
 def _text(remark: str) -> str:
-    """Nothing in a remark is markup but what stands between backticks."""
+    """A remark as Markdown: only what stands between backticks is markup."""
     parts = remark.split("`")
     return "".join(_code(part) if k % 2 else _plain(part) for k, part in enumerate(parts))
 
 
-def _plain(words: str) -> str:
-    plain = escape(words, quote=False)
+def _plain(text: str) -> str:
+    plain = escape(text, quote=False)
     return re.sub(r"[|*_\[\]{}]", lambda sign: f"&#{ord(sign.group())};", plain)

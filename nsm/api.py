@@ -1,18 +1,21 @@
-"""The public Python API: the words of the command line, as functions."""
+"""The public Python API: the tasks of the command line as functions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
-from nsm.config import compose_config
+from nsm.config import compose_config, conf_folder, unknown_setting
+from nsm.config_docs import known_keys
 from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
-from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
+from nsm.instantiation import target_of
+from nsm.pipeline import Given, run_task
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.results import (
     NeuralSurface,
@@ -34,14 +37,18 @@ def overfit(
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: bool = True,
+    **settings: Any,
 ) -> NeuralSurface:
-    """Train a network to be the surface.
+    """Train a network to reproduce a surface.
 
     Args:
         surface: the prepared surface.
         overrides: settings as on the command line, e.g. ``["trainer.max_steps=1000"]``.
         folder: where to leave the run's files; without it they are not kept.
         progress: show a progress bar.
+        **settings: settings by name: a string chooses the option of a group, a dictionary sets
+            the settings within, a class is what ``_target_`` names:
+            ``activation="silu", trainer={"max_steps": 1000}, seed=1``.
 
     Returns:
         The neural surface φ with its figures in ``metrics``.
@@ -50,13 +57,13 @@ def overfit(
         NsmError: a setting that does not exist or cannot be used.
 
     Examples:
-        >>> phi = nsm.overfit(nsm.Surface.load("terrain"), overrides=["experiment=quick"])
+        >>> phi = nsm.overfit(nsm.Surface.load("terrain"), experiment="quick")
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
     _expect(surface, Surface)
-    words = _words("overfit", overrides, [surface], ("landmarks",))
-    with _place(folder, words, progress) as (config, place):
-        return run_overfit(config, place, surface)
+    request = _Request("overfit", overrides, settings, [surface])
+    with request.run(folder, progress) as (config, place):
+        return run_task(config, place, given=Given(surface=surface))
 
 
 def parameterize(
@@ -65,14 +72,14 @@ def parameterize(
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: bool = True,
+    **settings: Any,
 ) -> Parameterization:
     """Flatten a neural surface to the plane with least distortion and a free boundary.
 
     Args:
         phi: the neural surface.
-        overrides: settings as on the command line, e.g. ``["energy=conformal"]``.
-        folder: where to leave the run's files; without it they are not kept.
-        progress: show a progress bar.
+        overrides, folder, progress, **settings: as for :func:`overfit`, e.g.
+            ``energy="conformal"``.
 
     Returns:
         The map with its new coordinates in ``uv``, and its figures beside those of libigl's
@@ -86,9 +93,9 @@ def parameterize(
         >>> flat.uv  # (V, 2), of the cut mesh's vertices
     """
     _expect(phi, NeuralSurface)
-    words = _words("param", overrides, [phi.surface], ("landmarks",))
-    with _place(folder, words, progress) as (config, place):
-        return run_param(config, place, phi)
+    request = _Request("param", overrides, settings, [phi.surface])
+    with request.run(folder, progress) as (config, place):
+        return run_task(config, place, given=Given(phi=phi))
 
 
 def map_pair(
@@ -99,11 +106,12 @@ def map_pair(
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: bool = True,
+    **settings: Any,
 ) -> SurfaceMap:
     """Map one surface to another with least distortion.
 
-    Two closed meshes, given as files, are cut alike through their landmarks, which is what makes
-    a good map; neural surfaces are taken as they are.
+    Two closed meshes, given as files, are cut along corresponding paths through their landmarks,
+    which gives the best maps; neural surfaces are taken as they are.
 
     Args:
         source: a neural surface, the folder of one, a mesh file, or a name of the catalogue.
@@ -111,9 +119,7 @@ def map_pair(
         landmarks: pairs ``[(i, j), ...]`` of vertices of the two mesh files, or of points (x, y,
             z), in lists, an array or a tensor; or a JSON file of them; or two files, one for each
             surface.
-        overrides: settings as on the command line, e.g. ``["energy=arap"]``.
-        folder: where to leave the run's files; without it they are not kept.
-        progress: show a progress bar.
+        overrides, folder, progress, **settings: as for :func:`overfit`, e.g. ``energy="arap"``.
 
     Returns:
         The map: ``f(points)``, ``f.transfer(values)``, ``f.metrics``.
@@ -126,9 +132,10 @@ def map_pair(
         >>> f(points)  # (N, 3) on the cat to (N, 3) on the horse
     """
     ready = [end.surface for end in (source, target) if isinstance(end, NeuralSurface)]
-    words = _words("pair_map", overrides, ready, () if landmarks is None else ("landmarks",))
-    with _place(folder, words, progress) as (config, place):
-        return run_pair_map(config, place, source, target, landmarks)
+    request = _Request("pair_map", overrides, settings, ready)
+    with request.run(folder, progress) as (config, place):
+        given = Given(source=source, target=target, landmarks=landmarks)
+        return run_task(config, place, given=given)
 
 
 def map_collection(
@@ -138,13 +145,14 @@ def map_collection(
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: bool = True,
+    **settings: Any,
 ) -> SurfaceCollection:
     """Put three surfaces or more into correspondence, every one with every other.
 
     Args:
         surfaces: as for :func:`map_pair`.
         landmarks: for each surface a list of vertices or points, or a file; or one JSON file.
-        overrides, folder, progress: as for :func:`map_pair`.
+        overrides, folder, progress, **settings: as for :func:`overfit`.
 
     Returns:
         The collection; ``collection.pair(i, j)`` is the map from one surface to another.
@@ -156,106 +164,170 @@ def map_collection(
         >>> animals = nsm.map_collection(["a.off", "b.off", "c.off"], ["a.vts", "b.vts", "c.vts"])
         >>> animals.pair(0, 2).transfer(colours)
     """
-    if not isinstance(surfaces, Sequence):
-        raise NsmError("surfaces: give a list of them")
+    if not isinstance(surfaces, Sequence) or isinstance(surfaces, str):
+        raise NsmError("surfaces: give a list of them", kind="wrong_type", key="surfaces")
     ready = [phi.surface for phi in surfaces if isinstance(phi, NeuralSurface)]
-    words = _words("collection_map", overrides, ready, () if landmarks is None else ("landmarks",))
-    with _place(folder, words, progress) as (config, place):
-        return run_collection_map(config, place, surfaces, landmarks)
+    request = _Request("collection_map", overrides, settings, ready)
+    with request.run(folder, progress) as (config, place):
+        return run_task(config, place, given=Given(surfaces=surfaces, landmarks=landmarks))
 
 
 # what the function that is called, and its arguments, say
-_SAID = (
-    "task",
-    "surface",
-    "surface.path",
-    "surface.name",
-    "phi.path",
-    "source",
-    "target",
-    "surfaces",
-)
+_ARGUMENTS = ("task", "surface", "phi.path", "source", "target", "surfaces", "landmarks")
 
 
-def _words(
-    task: str, overrides: Sequence[str], ready: Sequence[Surface], said: Sequence[str]
-) -> list[str]:
+class _Request:
     """The settings of a call.
 
     Args:
         task: of the function.
-        overrides: as the user gives them.
-        ready: the prepared surfaces that it is called with: their domain is taken.
-        said: settings, beside :data:`_SAID`, that its arguments say.
+        overrides, settings: as the user gives them.
+        ready: the prepared surfaces among the arguments: their domain is taken.
 
     Raises:
-        NsmError: no list of settings, or one that would do nothing beside the arguments.
+        NsmError: no settings, unknown ones, or some that conflict with each other or with the
+            arguments.
     """
-    if isinstance(overrides, str) or not all(isinstance(word, str) for word in overrides):
-        raise NsmError('overrides: give a list of settings, as in ["trainer.max_steps=1000"]')
-    own = [f"task={task}", *(f"domain={surface.domain}" for surface in ready[:1])]
-    for word in overrides:
-        key = word.lstrip("+~").split("=")[0]
-        if key == "resume":
-            raise NsmError(f"overrides: {word}: a run goes on with the command, nsm {word}")
-        taken = key in (*_SAID, *said) or (key == "domain" and ready)
-        if taken and word not in own:
+
+    def __init__(
+        self,
+        task: str,
+        overrides: Sequence[str],
+        settings: Mapping[str, Any],
+        ready: Sequence[Surface],
+    ) -> None:
+        if isinstance(overrides, str) or not all(isinstance(word, str) for word in overrides):
             raise NsmError(
-                f"overrides: {word}: the function and its arguments say that; leave it out"
+                'overrides: give a list of settings, as in ["trainer.max_steps=1000"]',
+                kind="wrong_type",
+                key="overrides",
             )
-    return [own[0], *overrides, *own[1:]]
+        known = {key.partition(".")[0] for key in known_keys()}
+        chosen, merged = [], {}
+        for key, value in settings.items():
+            if key not in known:
+                raise unknown_setting(key)
+            if value is None or isinstance(value, str) and (conf_folder() / key).is_dir():
+                chosen.append(f"{key}={'null' if value is None else value}")
+            else:
+                merged[key] = _plain(value)
+        keys = [word.lstrip("+~").partition("=")[0] for word in overrides]
+        for key in (*keys, *settings):
+            if key != "task" or not isinstance(merged.get(key), dict):  # a variant of the task
+                self._check(key, ready)
+        for key in settings:
+            twice = [k for k in keys if k == key or k.startswith(f"{key}.")]
+            if twice:
+                raise NsmError(
+                    f"{twice[0]}: given in overrides and as an argument; omit one",
+                    kind="conflicting_settings",
+                    key=twice[0],
+                )
+        if ready:
+            domain = str(ready[0].domain)
+            if (conf_folder() / "domain" / f"{domain}.yaml").is_file():
+                chosen.append(f"domain={domain}")
+            else:
+                merged["domain"] = ready[0].domain.config
+        self.overrides, self.settings = [f"task={task}", *overrides, *chosen], merged
+
+    def _check(self, key: str, ready: Sequence[Surface]) -> None:
+        """NsmError for a setting that would do nothing beside the arguments."""
+        said = (*_ARGUMENTS, *(["domain"] if ready else []))
+        if key == "resume":
+            raise NsmError(
+                "resume: the command continues runs, nsm resume=FOLDER",
+                kind="conflicting_settings",
+                key=key,
+            )
+        if any(key == one or key in (f"{one}.path", f"{one}.name") for one in said):
+            raise NsmError(
+                f"{key}: the function and its arguments set it; omit it",
+                kind="conflicting_settings",
+                key=key,
+            )
+
+    @contextmanager
+    def run(self, folder: str | Path | None, progress: bool) -> Iterator[tuple[DictConfig, Path]]:
+        """The configuration, and the run folder: a temporary one, without logs, if none is given.
+
+        Raises:
+            NsmError: settings that cannot be used, or a folder that cannot be written.
+        """
+        overrides = list(self.overrides)
+        if not progress:
+            overrides.append("trainer.progress=false")
+        try:
+            if folder is not None:
+                config = compose_config(overrides, self.settings)
+                with folder_lock(Path(folder)):
+                    yield config, Path(folder)
+                return
+            if "logger" not in self.settings and not any("logger" in o for o in overrides):
+                overrides.append("logger=none")
+            with passing_folder() as temporary:
+                config = compose_config([*overrides, "artefacts=false"], self.settings)
+                yield config, Path(temporary)
+        except OSError as error:
+            raise NsmError(
+                f"{of_disk(error)}; give another folder, or make room", kind="unwritable_folder"
+            ) from error
+
+
+def _plain(value: Any) -> Any:
+    """A setting with ``_target_`` for the classes in it."""
+    if inspect.isclass(value):
+        return {"_target_": _name(value)}
+    if isinstance(value, Mapping):
+        return {k: _name(v) if k == "_target_" else _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _name(target: Any) -> Any:
+    """The ``_target_`` of a class or function; a name as it is."""
+    return target_of(target) if callable(target) else target
 
 
 def _expect(given: Any, kind: type) -> None:
     if not isinstance(given, kind):
-        raise NsmError(f"give a {kind.__name__}, not a {type(given).__name__}")
-
-
-@contextmanager
-def _place(
-    folder: str | Path | None, words: list[str], progress: bool
-) -> Iterator[tuple[DictConfig, Path]]:
-    """The configuration, and the run folder: a passing one, without logs, if none is given."""
-    if not progress:
-        words = [*words, "trainer.progress=false"]
-    try:
-        if folder is not None:
-            config = compose_config(words)
-            with folder_lock(Path(folder)):
-                yield config, Path(folder)
-            return
-        with passing_folder() as temporary:
-            yield compose_config([*words, "logger=none", "artefacts=false"]), Path(temporary)
-    except OSError as error:
-        raise NsmError(f"{of_disk(error)}; give another folder, or make room") from error
+        raise NsmError(f"give a {kind.__name__}, not a {type(given).__name__}", kind="wrong_type")
 
 
 def load(
-    folder: str | Path,
+    folder: str | Path, *, trust: str | Sequence[str] = ()
 ) -> NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection:
-    """Give back the result of a run.
+    """Load the result of a run.
 
     Args:
         folder: the run folder, or its ``surface.safetensors``.
+        trust: modules of yours of which the files may name classes, such as ``["mypackage"]``;
+            loading runs their code.
 
     Returns:
         What the run made: a neural surface, or a map with the surfaces it needs.
 
     Raises:
-        NsmError: nothing there, or a file that is damaged or of another version.
+        NsmError: nothing there, or a file that is damaged, of another version, or that names a
+            class outside nsm, torch and the trusted modules.
     """
-    place = Path(folder)
+    place, trust = Path(folder), (trust,) if isinstance(trust, str) else tuple(trust)
     if not place.exists():
-        raise NsmError(f"{folder}: no such folder; give the folder of a run")
+        raise NsmError(
+            f"{folder}: no such folder; give the folder of a run",
+            kind="missing_file",
+            key=str(folder),
+        )
     if (place / "collection.json").exists():
-        return load_collection(folder)
+        return load_collection(folder, trust=trust)
     if (place / "pair.json").exists():
-        return load_surface_map(folder)
+        return load_surface_map(folder, trust=trust)
     if (place / "map.json").exists():
-        return load_parameterization(folder)
+        return load_parameterization(folder, trust=trust)
     if place.is_dir() and not list(place.glob("surface.*")):
-        raise NsmError(f"{folder}: {_no_result(place)}")
-    return load_surface(folder)
+        raise NsmError(f"{folder}: {_no_result(place)}", kind="missing_file", key=str(folder))
+    return load_surface(folder, trust=trust)
 
 
 def _no_result(folder: Path) -> str:
@@ -272,5 +344,5 @@ def _no_result(folder: Path) -> str:
         runs = f"{len(within)} run{'s' if len(within) > 1 else ''}"
         return f"a folder of {runs}; give {give} {newest}"
     if (folder / "config.yaml").exists():
-        return f"a run that has not ended; nsm resume={folder} goes on with it"
+        return f"an unfinished run; nsm resume={folder} continues it"
     return "no run there; give the folder of a run"

@@ -1,4 +1,4 @@
-"""Command lines of ``nsm WORD ...``: mistakes are told in one line."""
+"""Command lines, with mistakes answered in one line."""
 
 from __future__ import annotations
 
@@ -12,4 +12,4 @@ class Arguments(argparse.ArgumentParser):
     """An argparse parser that raises :class:`NsmError` where argparse prints its usage."""
 
     def error(self, message: str) -> NoReturn:
-        raise NsmError(f"{message}; see {self.prog} --help")
+        raise NsmError(f"{message}; see {self.prog} --help", kind="bad_argument")

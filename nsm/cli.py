@@ -1,162 +1,244 @@
-"""The command ``nsm``: compose the configuration, run the task, say errors in one line."""
+"""The command ``nsm``: compose the configuration, run the task, answer errors in one line."""
 
 from __future__ import annotations
 
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+import sysconfig
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from nsm.arguments import Arguments
-from nsm.config import checked, conf_folder, one_line, register_resolvers
+from nsm.config import checked, conf_folder, prepared_overrides, register, setting_error
 from nsm.errors import NsmError, of_disk
-from nsm.plugins import import_plugins
+from nsm.plugins import import_here, import_plugins
 from nsm.run_directories import remove_empty
 from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
 # input. Imported only when called for.
 COMMANDS: dict[str, str] = {"report": "nsm.commands.report", "view": "nsm.commands.view"}
+# Hydra's documented flags, and whether each has a value
+_HYDRA_FLAGS: dict[tuple[str, ...], dict[str, Any]] = {
+    ("--hydra-help",): {"action": "store_true"},
+    ("--cfg", "-c"): {"choices": ["job", "hydra", "all"]},
+    ("--resolve",): {"action": "store_true"},
+    ("--package", "-p"): {},
+    ("--run", "-r"): {"action": "store_true"},
+    ("--multirun", "-m"): {"action": "store_true"},
+    ("--shell-completion", "-sc"): {"action": "store_true"},
+    ("--config-path", "-cp"): {},
+    ("--config-name", "-cn"): {},
+    ("--config-dir", "-cd"): {},
+    ("--info", "-i"): {
+        "nargs": "?",
+        "const": "all",
+        "choices": ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"],
+    },
+}
+_MODES = ("run", "multirun", "cfg", "info", "shell_completion")
 
 
-def _run(config: DictConfig) -> bool:
-    """Run the one job of a command that is no sweep; False if its input was bad.
+def main() -> None:
+    """Entry point. Exit status 0; 1 if jobs of a sweep failed or a defect showed, 2 for bad input
+    (one line on stderr), 130 if interrupted."""
+    arguments = sys.argv[1:]
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        import_here()
+        status = _main(arguments)
+    except KeyboardInterrupt:
+        status = 130
+    except Exception as error:
+        if debug:
+            traceback.print_exception(error)
+        status = _answer(error)
+    if status:
+        sys.exit(status)
 
-    Hydra would add a line of its own to an exception.
+
+def _main(arguments: list[str]) -> int:
+    if arguments and arguments[0] in COMMANDS:
+        importlib.import_module(COMMANDS[arguments[0]]).main(arguments[1:])
+    elif {"--help", "-h"} & set(arguments):
+        from nsm.help import main
+
+        main([argument for argument in arguments if not argument.startswith("-")])
+    elif "--version" in arguments:  # Hydra would print its own
+        print(f"nsm {version('nsm')}")
+    else:
+        return _run_tasks(_hydra_arguments(arguments))
+    return 0
+
+
+def _hydra_arguments(arguments: Sequence[str]) -> list[str]:
+    """A command line as Hydra takes it: flags first, and mesh files as settings.
+
+    Raises:
+        NsmError: a flag that does not exist, or flags that exclude each other.
     """
+    parser = Arguments(prog="nsm", add_help=False, allow_abbrev=False)
+    for names, options in _HYDRA_FLAGS.items():
+        parser.add_argument(*names, **options)
+    parser.add_argument("overrides", nargs="*")
+    given, unknown = parser.parse_known_intermixed_args(arguments)
+    if unknown:
+        raise NsmError(
+            f"{unknown[0]}: no such flag; see nsm --help and nsm --hydra-help",
+            kind="unknown_flag",
+            key=unknown[0],
+        )
+    if given.resolve and not given.cfg:
+        raise NsmError("--resolve: give it with --cfg job", kind="unknown_flag", key="--resolve")
+    if sum(bool(getattr(given, mode)) for mode in _MODES) > 1:
+        raise NsmError(
+            "-r, -m, --cfg, --info and -sc exclude each other; give one",
+            kind="conflicting_flags",
+        )
+    flags = []
+    for name, *_ in _HYDRA_FLAGS:
+        value = getattr(given, name.strip("-").replace("-", "_"))
+        flags += [name] if value is True else [name, value] if value else []
+    if given.shell_completion:  # its overrides are query=bash, install=bash
+        return [*flags, *given.overrides]
+    return [*flags, *prepared_overrides(given.overrides)]
+
+
+def _run_tasks(arguments: list[str]) -> int:
+    register()
+    import_plugins()
+    OUTCOMES.clear()
+
+    failures: list[Exception] = []
+
+    @hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
+    def job(config: DictConfig) -> None:
+        try:
+            _run(config)
+        except Exception as error:  # Hydra would print a line of its own about it
+            failures.append(error)
+
+    with _process_of_hydra(arguments):
+        job()
+    if failures:
+        raise failures[0]
+    return _sum_up() if OUTCOMES else 0
+
+
+@contextmanager
+def _process_of_hydra(arguments: list[str]) -> Iterator[None]:
+    """Give Hydra its command line, and let exceptions through instead of printing them."""
+    before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [sys.argv[0], *arguments]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        sys.argv = before[0]
+        if before[1] is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before[1]
+
+
+def _run(config: DictConfig) -> None:
+    """Run the one job of a command that is no sweep."""
     folder = Path(HydraConfig.get().runtime.output_dir)
+    overrides = list(HydraConfig.get().overrides.task)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
-        typed = checked(config)
-        if typed.resume is not None:
-            _check_alone(str(typed.resume), HydraConfig.get().overrides.task)
+        complete = checked(config, overrides)
+        if complete.resume is not None:
+            _check_alone(str(complete.resume), overrides)
         from nsm.pipeline import run
 
-        run(typed, folder)
-    except NsmError as error:
-        _say(str(error))
-        return False
-    except MemoryError:
-        _say("not enough memory; give a smaller mesh, network or data.batch_size")
-        return False
-    except OSError as error:  # a disk that is full or read-only, a folder that may not be written
-        _say_of_disk(error)
-        return False
+        run(complete, folder)
     finally:
         here = Path.cwd()
         if folder != here:  # folders around it that are not within are not Hydra's, and stay
             remove_empty([folder, *(place for place in folder.parents if here in place.parents)])
-    return True
 
 
-def _check_alone(resume: str, words: Sequence[str]) -> None:
-    """NsmError for settings beside ``resume``: they would do nothing."""
-    others = [word for word in words if not word.startswith("resume=")]
+def _check_alone(resume: str, overrides: Sequence[str]) -> None:
+    """NsmError for settings beside ``resume``, which would have no effect."""
+    others = [word for word in overrides if not word.startswith(("resume=", "trust="))]
     if others:
         raise NsmError(
-            f"resume={resume}: a run goes on with the settings in its config.yaml; leave out "
-            f"{' '.join(others)}"
+            f"resume={resume}: a run continues with the settings in its config.yaml; omit "
+            f"{' '.join(others)}",
+            kind="conflicting_settings",
+            key="resume",
         )
 
 
-def main() -> None:
-    """Entry point. Exit status 0; 1 if jobs of a sweep failed, 2 for bad input (one line on
-    stderr), 130 if interrupted."""
-    words = sys.argv[1:]
-    if words and words[0] in COMMANDS:
-        _command(COMMANDS[words[0]], words[1:])
-    elif {"--help", "-h"} & set(words):
-        _command("nsm.help", [word for word in words if not word.startswith("-")])
-    elif "--version" in words:  # Hydra would tell its own
-        print(f"nsm {version('nsm')}")
-    else:
-        _tasks()
-
-
-def _command(module: str, words: list[str]) -> None:
-    try:
-        importlib.import_module(module).main(words)
-    except NsmError as error:
-        _say(str(error))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
-
-
-def _tasks() -> None:
-    register_resolvers()
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach us instead of being printed
-    OUTCOMES.clear()
-    good: list[bool] = []
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
-
-    @hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
-    def job(config: DictConfig) -> None:
-        good.append(_run(config))
-
-    try:
-        _check_flags(sys.argv[1:])
-        import_plugins()
-        job()
-    except NsmError as error:
-        _say(str(error))
-        sys.exit(2)
-    except (HydraException, OmegaConfBaseException) as error:
-        _say(one_line(error, words))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except OSError as error:  # Hydra makes the run folder before anything of ours runs
-        _say_of_disk(error)
-        sys.exit(2)
-    if not all(good):
-        sys.exit(2)
-    if OUTCOMES:
-        _sum_up()
-
-
-def _check_flags(words: Sequence[str]) -> None:
-    """NsmError for flags that Hydra would answer with its usage, or with a traceback."""
-    parser = Arguments(prog="nsm", add_help=False, parents=[get_args_parser()])
-    given, rest = parser.parse_known_args(words)
-    if rest and rest[0].startswith("-"):
-        raise NsmError(f"{rest[0]}: no flag is called so; see nsm --help and nsm --hydra-help")
-    if rest:
-        raise NsmError(f"{rest[0]}: give flags, such as -m, before all settings")
-    if given.resolve and not given.cfg:
-        raise NsmError("--resolve: give it with --cfg job")
-    if given.experimental_rerun is not None:
-        raise NsmError("--experimental-rerun: nsm resume=FOLDER goes on with a run instead")
-    modes = ("run", "multirun", "cfg", "info", "shell_completion")
-    if sum(bool(getattr(given, mode)) for mode in modes) > 1:
-        raise NsmError("-r, -m, --cfg, --info and -sc exclude each other; give one")
-
-
-def _sum_up() -> None:
-    """Say how a sweep went; exit status 1 if jobs of it failed."""
+def _sum_up() -> int:
+    """Print how a sweep went; exit status 1 if jobs of it failed."""
     failed = [outcome for outcome in OUTCOMES if outcome.error is not None]
     print(summary(OUTCOMES))
     for outcome in failed:
         _say(f"failed: {' '.join(outcome.words) or outcome.folder}: {outcome.error}")
-    if failed:
-        sys.exit(1)
+    return 1 if failed else 0
 
 
-def _say_of_disk(error: OSError) -> None:
-    _say(f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room")
+def _answer(error: Exception) -> int:
+    """Print an exception in one line; give the exit status."""
+    raised = traceback.extract_tb(error.__traceback__)[-1].filename
+    of_hydra = isinstance(error, ValueError) and raised.startswith(str(Path(hydra.__file__).parent))
+    if of_hydra or isinstance(error, (HydraException, OmegaConfBaseException)):
+        error = setting_error(error)
+    elif isinstance(error, MemoryError):
+        error = NsmError("not enough memory; give a smaller mesh, network or data.batch_size")
+    elif isinstance(error, OSError):  # a full or read-only disk, a folder without permission
+        error = NsmError(
+            f"{of_disk(error)}; choose another folder with hydra.run.dir=FOLDER, or make room"
+        )
+    place = _place(error)
+    if isinstance(error, NsmError):
+        _say(f"{error} ({place}; nsm --debug shows the traceback)" if place else str(error))
+        return 2
+    reason = " ".join(str(error).split())[:300]
+    where = f" ({place})" if place else ""
+    _say(f"{type(error).__name__}: {reason}{where}; nsm --debug shows the traceback")
+    return 1
+
+
+def _place(error: BaseException) -> str:
+    """The last line of the user's own code that an exception passed through, as FILE:LINE.
+
+    Of an exception that passed through none, the last line of nsm's, unless it is an answer to
+    bad input.
+    """
+    package = Path(__file__).parent
+    ours = (str(package), str(package.parent / "hydra_plugins"))
+    libraries = [sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib")]
+    chain, own = [], ""
+    link: BaseException | None = error
+    while link is not None and link not in chain:
+        chain.append(link)
+        for frame in traceback.extract_tb(link.__traceback__):
+            place = f"{frame.filename}:{frame.lineno}"
+            if frame.filename.startswith(ours):
+                own = place
+            elif not frame.filename.startswith((*libraries, "<", sys.prefix)):
+                return place
+        link = link.__cause__ or link.__context__
+    return "" if isinstance(error, NsmError) else own
 
 
 def _say(message: str) -> None:
-    """One line, whatever is in the names that it tells."""
+    """Print one line, whatever is in the names within it."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
     print(f"nsm: {line}", file=sys.stderr)
 

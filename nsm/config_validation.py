@@ -1,258 +1,315 @@
-"""The settings that each choice takes, read off the code that takes them.
+"""Check a composed configuration against the signatures of what it names, and complete it.
 
-The groups whose keys depend on the choice (activation, encoding, energy, constraints, optimizer,
-scheduler) are checked here against the signatures of what is built from them, and then by
-building it once in small, so that a mistake is told before any work.
+A mistake shows here, in one line with the nearest name, before any work begins.
 """
 
 from __future__ import annotations
 
 import difflib
-import inspect
-import types
-import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import math
+import random
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Union
+from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from nsm.domains import DOMAINS
-from nsm.domains.common_seams import SEAMS
-from nsm.domains.embedding import METHODS
-from nsm.energies import ENERGIES, Blend
+from nsm.config import COLLECTIONS, GROUPS, setting_error, unknown_setting
 from nsm.errors import NsmError
-from nsm.maps import build_map
-from nsm.maps.activations import ACTIVATIONS
-from nsm.maps.encodings import ENCODINGS
-from nsm.maps.networks import BLOCKS, INITIALIZATIONS, LINEAR_SKIPS
-from nsm.results.loggers import LOGGERS, require
-from nsm.tasks import Overfit, Param
-from nsm.tasks.constrained import BOUNDARIES, LANDMARKS, Constraints
-from nsm.tasks.optimizers import OPTIMIZERS, SCHEDULERS, build_optimizer, build_scheduler
-from nsm.tasks.param import BOUNDARIES as PARAM_BOUNDARIES
+from nsm.instantiation import made, named_object
+from nsm.plugins import import_plugins
+from nsm.settings import Misfit, Parameter, Settings, fit, parameters, parts
 
-ACCELERATORS = ("auto", "cpu", "gpu")
+# parameters of a group's target that come from the program, not from settings
+SUPPLIED: dict[str, tuple[str, ...]] = {
+    "map": ("out_dim", "activation", "encoding"),
+    "encoding": ("in_dim",),
+    "data": ("surface", "surfaces", "rotations", "sampler", "seed"),
+    "optimizer": ("params", "groups"),
+    "scheduler": ("optimizer", "max_steps"),
+    "logger": ("folder", "first_step", "every"),
+}
+# settings of ours beside the parameters of a group's target
+EXTRA: dict[str, dict[str, Parameter]] = {
+    "optimizer": {
+        "encoding_lr": Parameter(
+            float | None, None, "rate of feature grids, whose entries see few samples in a step"
+        )
+    },
+    "loss_terms": {"weight": Parameter(float, remark="what the term is multiplied by")},
+    "task": {"name": Parameter(str | None, None, "its name in folders and messages")},
+}
+# settings of the group ``initialization`` in others: a target that lacks them goes without
+_FROM_INITIALIZATION = ("map.linear_skip", "scheduler.peak")
+_HYDRA_KEYS = ("_target_", "_partial_", "_convert_", "_recursive_", "_args_")
+_LARGEST_NUMBER = 2**63 - 1  # that whole numbers of 64 bits hold
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """What a choice takes under a key: values of a type (anything if None), or words."""
+def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
+    """The configuration resolved, checked, and completed with the defaults of nsm's classes.
 
-    type: Any = None
-    words: tuple[str, ...] = ()
-    required: bool = False
-
-
-Parameters = dict[str, Parameter]
-
-# what every optimiser, and every schedule, takes beside its own parameters
-_ALL_OPTIMIZERS: Parameters = {"encoding_lr": Parameter(float | None)}
-_ALL_SCHEDULERS: Parameters = {"warmup": Parameter(int), "peak": Parameter(float)}
-
-
-def check_choices(config: DictConfig) -> None:
-    """Check what the types of :class:`nsm.config.Schema` leave open.
+    Args:
+        config: as composed, or as a run has stored it.
+        overrides: those that the user gave. Where they replace the ``_target_`` of an option, the
+            option's own parameters that the new target lacks are left out.
 
     Raises:
-        NsmError: a key that the choice does not take, with the nearest that it does; a value of
-            the wrong type; a word that is not known; settings of which nothing can be built.
+        NsmError: a setting that does not exist or is missing, a value of the wrong type or out of
+            range, or settings of which nothing can be made.
     """
-    settings: Any = OmegaConf.to_container(config)
-    task = settings["task"]["name"]
-    _one_of("task.name", task, TASK_CHOICES)
-    for key, words in _WORDS.items():
-        _one_of(key, OmegaConf.select(config, key), words)
-    for kind in settings["logger"]["kinds"]:
-        _one_of("logger.kinds", kind, LOGGERS)
-        require(kind)
-    for group, known in named().items():
-        _check_named(group, settings[group], known)
-    if settings["map"]["linear_skip"] == "fitted" and task != "overfit":
-        raise NsmError(
-            f"setting map.linear_skip: task={task} has no surface to fit; "
-            "take initialization=random"
-        )
-    choice = TASK_CHOICES[task]
-    if choice.constraints:
-        held = settings["constraints"] or {}
-        _check(f"task={task}", "constraints", held, choice.constraints)
-    elif settings["constraints"] is not None:
-        raise NsmError(f"setting constraints: task={task} has none; leave them out")
-    _check(f"task={task}", "energy", settings["energy"], choice.energy)
-    if "weights" in choice.energy:
-        weights = {name: Parameter(float) for name in ENERGIES}
-        _check("the energy", "energy.weights", settings["energy"]["weights"], weights)
-    _build(settings, choice)
-
-
-def parameters(function: Callable[..., Any], skip: int = 0) -> Parameters:
-    """The parameters of a function or class by name, without the first ``skip``."""
-    takes = list(inspect.signature(function).parameters.values())[skip:]
+    import_plugins()  # the jobs of a sweep may run in processes of their own
     try:
-        hints = typing.get_type_hints(function.__init__ if inspect.isclass(function) else function)
-    except (NameError, TypeError):  # annotations that cannot be resolved say nothing
-        hints = {}
-    return {
-        p.name: Parameter(hints.get(p.name), required=p.default is inspect.Parameter.empty)
-        for p in takes
-        if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
-    }
-
-
-def _lambdas(task: type) -> Parameters:
-    return {k: p for k, p in parameters(task).items() if k.startswith("lambda_")}
-
-
-@dataclass(frozen=True)
-class TaskChoice:
-    """What a task takes in the groups energy and constraints, and what they are built into."""
-
-    energy: Parameters
-    constraints: Parameters
-    held: Callable[..., Any] | None = None
-
-
-_WEIGHTS: Parameters = {"weights": Parameter(dict, required=True)}
-_CONSTRAINTS: Parameters = {
-    **parameters(Constraints),
-    "boundary": Parameter(words=BOUNDARIES, required=True),
-    "landmarks": Parameter(words=LANDMARKS, required=True),
-}
-
-TASK_CHOICES: dict[str, TaskChoice] = {
-    "overfit": TaskChoice(_lambdas(Overfit), {}),
-    "param": TaskChoice(
-        _WEIGHTS,
-        {**_lambdas(Param), "boundary": Parameter(words=PARAM_BOUNDARIES, required=True)},
-    ),
-    "pair_map": TaskChoice(_WEIGHTS, _CONSTRAINTS, Constraints),
-    "collection_map": TaskChoice(_WEIGHTS, _CONSTRAINTS, Constraints),
-}
-
-
-def named() -> dict[str, dict[str, Parameters]]:
-    """Group to name to what it takes, with what has been registered."""
-    return {
-        "activation": {
-            name: {key: Parameter(float) for key in formulas.defaults}
-            for name, formulas in ACTIVATIONS.items()
-        },
-        "encoding": {name: parameters(cls, skip=1) for name, cls in ENCODINGS.items()},
-        "optimizer": {
-            name: {**parameters(cls, skip=1), **_ALL_OPTIMIZERS} for name, cls in OPTIMIZERS.items()
-        },
-        "scheduler": {
-            name: {**parameters(function, skip=1), **_ALL_SCHEDULERS}
-            for name, function in SCHEDULERS.items()
-        },
-    }
-
-
-_WORDS: dict[str, Iterable[str]] = {
-    "domain": DOMAINS,
-    "map.block": BLOCKS,
-    "map.initialization": INITIALIZATIONS,
-    "map.linear_skip": LINEAR_SKIPS,
-    "surface.parameterization": METHODS,
-    "seam.path": ("auto", *SEAMS),
-    "trainer.accelerator": ACCELERATORS,
-}
-
-
-def _check_named(group: str, given: Mapping[str, Any], known: Mapping[str, Parameters]) -> None:
-    if "name" not in given:
-        raise NsmError(f"setting {group}.name: missing; choose one of {', '.join(known)}")
-    _one_of(f"{group}.name", given["name"], known)
-    rest = {key: value for key, value in given.items() if key != "name"}
-    _check(f"{group}={given['name']}", group, rest, known[given["name"]])
-
-
-def _check(what: str, group: str, given: Mapping[str, Any], known: Parameters) -> None:
-    for key, value in given.items():
-        if key not in known:
-            raise NsmError(
-                f"setting {group}.{key}: {what} takes no such setting; {_hint(key, known)}"
-            )
-        if known[key].words:
-            _one_of(f"{group}.{key}", value, known[key].words)
-        elif not _fits(value, known[key].type):
-            raise NsmError(f"setting {group}.{key}: {value!r} is not {_called(known[key].type)}")
+        settings: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise setting_error(error) from error
+    _check_values("", settings)
+    given = {override.lstrip("+").partition("=")[0] for override in overrides}
+    known, _ = parameters(Settings)
+    everything = {**known, **dict.fromkeys((*GROUPS, "logger", "loss_weights", "constraints"))}
+    for key in settings:
+        if key not in everything:
+            raise unknown_setting(key)
+    result: dict[str, Any] = {}
+    for key in GROUPS:
+        if settings.get(key) or key != "energy":
+            result[key] = _target(key, key, settings.get(key), given)
+        else:
+            result[key] = None
+    for key in COLLECTIONS:
+        result[key] = {
+            name: _target(f"{key}.{name}", key, node, given)
+            for name, node in _mapping(key, settings.get(key) or {}).items()
+        }
     for key, parameter in known.items():
-        if parameter.required and key not in given:
-            raise NsmError(f"setting {group}.{key}: {what} needs it; give +{group}.{key}=...")
+        if key in COLLECTIONS:
+            continue
+        if key in parts():
+            result[key] = _part(key, settings.get(key) or {}, parameters(parameter.kind)[0])
+        else:
+            result[key] = _fit(key, settings.get(key, parameter.default), parameter)
+    task = named_object(result["task"]["_target_"])
+    result["task"]["name"] = result["task"]["name"] or task.__name__.lower()
+    module = getattr(task, "module", None)
+    for key, name in (("constraints", "Constraints"), ("loss_weights", "Weights")):
+        result[key] = _of_task(key, settings.get(key), getattr(module, name, None), result)
+    _build(result)
+    if result["phi"]["overrides"]:
+        from nsm.config import compose_config
+
+        compose_config(["task=overfit", *result["phi"]["overrides"]])
+    order = [key for key in (*GROUPS, *everything) if key in result]
+    return OmegaConf.create({key: result[key] for key in dict.fromkeys(order)})
 
 
-def _one_of(key: str, value: Any, words: Iterable[str]) -> None:
-    if value not in words:
-        raise NsmError(f"setting {key}: {value!r} is not known; {_hint(str(value), words)}")
+def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, Any]:
+    """A checked node with ``_target_``, at a key, of a group."""
+    settings = _mapping(key, node or {})
+    name = settings.get("_target_")
+    if not isinstance(name, str):
+        hint = f"give {key}._target_=MODULE.CLASS"
+        if key == group:
+            hint = f"choose {group}=OPTION, or {hint}"
+        raise NsmError(f"setting {key}: missing; {hint}", kind="missing_setting", key=key)
+    known, others = takes(group, _imported(f"{key}._target_", name))
+    retargeted = f"{key}._target_" in given or f"{group}._target_" in given
+    result = {"_target_": name}
+    for k, value in settings.items():
+        dotted = f"{key}.{k}"
+        if k in _HYDRA_KEYS:
+            result[k] = value
+        elif k in known:
+            result[k] = _fit(dotted, value, known[k])
+        elif others:
+            result[k] = _nested(dotted, value)
+        elif dotted in given or not (retargeted or dotted in _FROM_INITIALIZATION):
+            raise unknown_setting(dotted, list(known), name)
+    for k, parameter in known.items():
+        if k in result or result.get("_partial_") or "_args_" in result:
+            continue
+        if parameter.required:
+            raise NsmError(
+                f"setting {key}.{k}: {name} needs it; give {key}.{k}=VALUE",
+                kind="missing_setting",
+                key=f"{key}.{k}",
+            )
+        if (name.startswith("nsm.") or k in EXTRA.get(group, ())) and _is_plain(parameter.default):
+            result[k] = _listed(parameter.default)
+    return result
 
 
-def _hint(word: str, known: Iterable[str]) -> str:
-    known = list(known)
-    if not known:
-        return "it takes none"
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+def takes(group: str, thing: Any) -> tuple[dict[str, Parameter], bool]:
+    """The settings that a class or function takes in a group, and whether it takes any others."""
+    known, others = parameters(thing)
+    supplied = SUPPLIED.get(group, ())
+    return {k: p for k, p in known.items() if k not in supplied} | EXTRA.get(group, {}), others
 
 
-def _fits(value: Any, kind: Any) -> bool:
-    """Whether a value from a YAML file is of an annotated type; numbers are lenient."""
-    if kind is None or kind is Any:
-        return True
-    origin, inside = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (Union, types.UnionType):
-        return any(_fits(value, one) for one in inside)
-    if kind is type(None):
-        return value is None
-    if kind is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool)
-    if kind is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    if origin is not None and issubclass(origin, Sequence):
-        return isinstance(value, list) and all(_fits(item, inside[0]) for item in value)
-    return isinstance(value, kind)
+def _nested(key: str, value: Any) -> Any:
+    """A value with the nodes in it that have a ``_target_`` checked."""
+    if isinstance(value, Mapping):
+        if "_target_" in value:
+            return _target(key, "", value, ())
+        return {k: _nested(f"{key}.{k}", v) for k, v in value.items()}
+    return [_nested(key, item) for item in value] if isinstance(value, list) else value
 
 
-def _called(kind: Any) -> str:
-    """A type as users know it."""
-    origin, inside = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (Union, types.UnionType):
-        known = [_called(one) for one in inside if one is not torch.Tensor]
-        return " or ".join(dict.fromkeys(known))
-    if origin is not None and issubclass(origin, Sequence):
-        return f"a list, each item {_called(inside[0])}"
-    names: dict[Any, str] = {
-        float: "a number",
-        int: "a whole number",
-        bool: "true or false",
-        type(None): "null",
-    }
-    return names.get(kind, f"of type {getattr(kind, '__name__', kind)}")
+def _fit(key: str, value: Any, parameter: Parameter) -> Any:
+    try:
+        return _nested(key, fit(value, parameter.kind))
+    except Misfit as misfit:
+        raise NsmError(f"setting {key}: {misfit}", kind=misfit.kind, key=key) from None
 
 
-def _build(settings: dict[str, Any], choice: TaskChoice) -> None:
-    """Build in small what the settings say; what is wrong with values is known to the code."""
-    with _told("map"), torch.random.fork_rng(devices=[]):
-        chosen = {key: settings[key] for key in ("activation", "encoding")}
-        network = build_map({**settings["map"], **chosen})
-    with _told("optimizer"):
-        optimizer = build_optimizer(network, settings["optimizer"])
-    with _told("scheduler"):
-        build_scheduler(optimizer, settings["scheduler"], settings["trainer"]["max_steps"])
-    with _told("energy"):
-        if "weights" in choice.energy:
-            Blend(settings["energy"]["weights"])
-    with _told("constraints"):
-        if choice.held:
-            choice.held(**settings["constraints"])
+def _part(key: str, node: Any, known: Mapping[str, Parameter], what: str = "") -> dict[str, Any]:
+    """A checked node of plain settings, with their defaults."""
+    given = _mapping(key, node)
+    for name in given:
+        if name not in known:
+            raise unknown_setting(f"{key}.{name}", list(known), what)
+    result = {}
+    for name, parameter in known.items():
+        if name not in given and parameter.required:
+            dotted = f"{key}.{name}"
+            raise NsmError(
+                f"setting {dotted}: {what or 'the run'} needs it; give {dotted}=VALUE",
+                kind="missing_setting",
+                key=dotted,
+            )
+        result[name] = _fit(f"{key}.{name}", given.get(name, parameter.default), parameter)
+    return result
+
+
+def _of_task(key: str, node: Any, kind: type | None, settings: Mapping[str, Any]) -> Any:
+    """The weights or constraints of a task, which names their type; those of yours may be any."""
+    name = settings["task"]["name"]
+    if kind is not None:
+        return _part(key, node or {}, parameters(kind)[0], f"task={name}")
+    if node and settings["task"]["_target_"].startswith("nsm.pipeline."):
+        raise NsmError(
+            f"setting {key}: task={name} has none; omit {key}", kind="unknown_setting", key=key
+        )
+    return node or None
+
+
+def _imported(key: str, target: str) -> Any:
+    """What a target names; NsmError with the nearest name in its module."""
+    try:
+        thing = named_object(target)
+    except NsmError as error:
+        module, _, name = target.rpartition(".")
+        near = difflib.get_close_matches(name, dir(sys.modules.get(module)), n=1, cutoff=0.6)
+        hint = f"; did you mean {module}.{near[0]!s}?" if near else ""
+        raise NsmError(f"setting {key}: {error}{hint}", kind="not_importable", key=key) from error
+    if not callable(thing):
+        raise NsmError(
+            f"setting {key}: {target} is no class and no function", kind="wrong_type", key=key
+        )
+    return thing
+
+
+def _mapping(key: str, node: Any) -> dict[str, Any]:
+    if not isinstance(node, Mapping):
+        raise NsmError(
+            f"setting {key}: {node!r} is no mapping; give {key}.NAME=VALUE; see nsm --help {key}",
+            kind="wrong_type",
+            key=key,
+        )
+    return dict(node)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether YAML can hold a value."""
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(map(_is_plain, value.values()))
+    return value is None or isinstance(value, (bool, int, float, str))
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _check_values(key: str, value: Any) -> None:
+    """NsmError for what no setting can hold.
+
+    An interpolation that is left came out of another value, such as a file's name, and would be
+    resolved when it is next looked at.
+    """
+    message, kind = "", "out_of_range"
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _check_values(f"{key}.{name}" if key else str(name), item)
+    elif isinstance(value, list):
+        for item in value:
+            _check_values(key, item)
+    elif isinstance(value, float) and not math.isfinite(value):
+        message = f"{value} is no finite number"
+    elif isinstance(value, int) and abs(value) > _LARGEST_NUMBER:
+        message = f"{value} is too large a number"
+    elif isinstance(value, str):
+        kind = "wrong_type"
+        if "${" in value:
+            message = "'${' is not accepted in a value; rename the file"
+        elif not value.isascii() and value != value.encode(errors="replace").decode():
+            message = f"{value!r} is not UTF-8; rename the file"
+    if message:
+        raise NsmError(f"setting {key}: {message}", kind=kind, key=key)
+
+
+def _build(settings: dict[str, Any]) -> None:
+    """Make once, in small, what the settings name: the code itself knows which values it takes."""
+    from nsm.maps.networks import build_network
+    from nsm.tasks.optimizers import build_optimizer
+    from nsm.tasks.schedules import build_scheduler
+
+    sampler = settings["sampler"]
+    if sampler.get("vertex_share", 0) + sampler.get("domain_share", 0) > 1:
+        raise NsmError(
+            "setting sampler.domain_share: with sampler.vertex_share it is more than 1",
+            kind="out_of_range",
+            key="sampler.domain_share",
+        )
+    with _same_random_numbers():
+        with _blamed("map"):
+            parts = {key: settings[key] for key in ("map", "activation", "encoding")}
+            network = build_network(**parts)
+        with _blamed("optimizer"):
+            optimizer = build_optimizer(network, settings["optimizer"])
+        with _blamed("scheduler"):
+            build_scheduler(optimizer, settings["scheduler"], settings["trainer"]["max_steps"])
+        for key in ("domain", "energy", "sampler"):
+            if settings[key]:
+                with _blamed(key):
+                    made(settings[key])
 
 
 @contextmanager
-def _told(group: str) -> Iterator[None]:
+def _same_random_numbers() -> Iterator[None]:
+    """Leave the random numbers of torch, numpy and Python as they were."""
+    states = random.getstate(), np.random.get_state()
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])
+
+
+@contextmanager
+def _blamed(group: str) -> Iterator[None]:
+    """Name the group in what is said of its values; other exceptions are defects and pass."""
     try:
         yield
-    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
-        raise NsmError(f"setting {group}: {' '.join(str(error).split())}") from error
+    except NsmError as error:
+        text = str(error)
+        text = text if text.startswith("setting ") else f"setting {group}: {text}"
+        key = error.key if error.key and error.key.startswith(f"{group}.") else group
+        raise NsmError(text, kind=error.kind, key=key) from error
+    except (ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise NsmError(f"setting {group}: {reason}", kind="not_instantiable", key=group) from error

@@ -1,14 +1,20 @@
-"""One's own energies, activations, encodings, blocks and analytic targets, under names.
+"""Your own activations, encodings, energies, blocks and analytic targets, under short names.
 
-What is registered is there for the Python process that registered it, wherever a setting or a
-saved file names it; settings and files hold names alone, and never say what to import.
+A class in a module of yours needs no registration: ``activation._target_=mypackage.MyActivation``.
+These functions are the short way for notebooks. What is registered is there for the Python process
+that registered it; saved files name it as ``nsm.extensions.registered.NAME``, and loading them
+needs the registration again.
 """
 
 from __future__ import annotations
 
+import copy
+import functools
 import inspect
 import re
-from collections.abc import Callable, Mapping, MutableMapping
+import sys
+import types
+from collections.abc import Callable, MutableMapping
 from functools import partial
 from typing import Any
 
@@ -16,18 +22,33 @@ import torch
 from hydra.core.config_store import ConfigStore
 from torch import Tensor, nn
 
-from nsm.energies import ENERGIES, Invariants
+from nsm.energies import Invariants
 from nsm.energies.distortion import of_invariants
 from nsm.errors import NsmError
-from nsm.maps import ACTIVATIONS, ANALYTIC, BLOCKS, ENCODINGS, Activation, Encoding, Formula
-from nsm.maps.activations import elementwise
+from nsm.maps import ANALYTIC, BLOCKS, Formula
+
+# a module of its own, so that ``_target_`` can name what is in it
+registered = types.ModuleType(f"{__name__}.registered")
+registered.__getattr__ = lambda name: _not_registered(name)  # type: ignore[method-assign]
+sys.modules[registered.__name__] = registered
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
-_OWN: set[tuple[str, str]] = set()  # kind and name
+_KINDS: dict[str, str] = {}  # of each registered name
+
+
+class _Elementwise(nn.Module):
+    """A function z ↦ f(z) of numbers as a module."""
+
+    def __init__(self, function: Callable[..., Tensor], parameters: dict[str, Any]) -> None:
+        super().__init__()
+        self.function, self.parameters_ = function, parameters
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.function(z, **self.parameters_)
 
 
 def register_energy(name: str, formula: Callable[[Invariants], Tensor]) -> None:
-    """Make a distortion energy known as ``energy=NAME`` and ``energy.weights.NAME``.
+    """Make a distortion energy known as ``energy=NAME``.
 
     Args:
         name: lower case letters, digits and underscores.
@@ -39,64 +60,84 @@ def register_energy(name: str, formula: Callable[[Invariants], Tensor]) -> None:
 
     Examples:
         >>> nsm.register_energy("stretch", lambda m: m.trace + 1 / (m.determinant + 1e-6))
-        >>> nsm.map_pair(a, b, landmarks, overrides=["energy=stretch"])
+        >>> nsm.map_pair(a, b, landmarks, energy="stretch")
     """
     energy = of_invariants(formula)
     same = torch.eye(2).expand(3, 2, 2)
     value = energy(same, same)
     if value.shape != (3,) or not bool(value.isfinite().all()):
-        raise NsmError(f"energy {name!r}: it must give one finite number a sample at an isometry")
-    _add("energy", name, ENERGIES, energy)
-    _offer("energy", name, {"weights": {name: 1.0}})
+        raise NsmError(
+            f"energy {name!r}: it must give one finite number for each sample at an isometry",
+            kind="wrong_shape",
+            key=name,
+        )
+    _register("energy", name, lambda: energy)
 
 
-def register_activation(name: str, function: Callable[..., Tensor]) -> None:
-    """Make an activation known as ``activation=NAME``; PyTorch finds f′ and f″.
+def register_activation(name: str, function: Callable[..., Any] | nn.Module) -> None:
+    """Make an activation known as ``activation=NAME``; PyTorch differentiates it.
 
     Args:
         name: lower case letters, digits and underscores.
-        function: z (...) to f(z) (...), entry by entry, made of PyTorch's functions. Further
-            arguments are settings: numbers, not negative, with defaults.
+        function: z (...) to f(z) (...), entry by entry, of PyTorch's functions, further arguments
+            of which are settings with defaults; or a module; or a class of modules.
 
     Raises:
         NsmError: a name that is taken or no name, or further arguments without defaults.
 
     Examples:
         >>> nsm.register_activation("swish", lambda z, beta=1.5: z * torch.sigmoid(beta * z))
-        >>> nsm.overfit(surface, overrides=["activation=swish", "activation.beta=2"])
+        >>> nsm.overfit(surface, activation={"_target_": "nsm.extensions.registered.swish"})
     """
-    settings = list(inspect.signature(function).parameters.values())[1:]
-    for parameter in settings:
+    if isinstance(function, nn.Module):
+        _register("activation", name, lambda: copy.deepcopy(function))
+    elif inspect.isclass(function):
+        _register("activation", name, function)
+    else:
+        _register("activation", name, _module_of(name, function))
+
+
+def _module_of(name: str, function: Callable[..., Tensor]) -> Callable[..., nn.Module]:
+    """From the settings of an activation that is a function to a module."""
+
+    def make(**settings: Any) -> nn.Module:
+        return _Elementwise(function, settings)
+
+    try:
+        parameters = list(inspect.signature(function).parameters.values())[1:]
+    except ValueError:  # torch.sin and others in C have no signature
+        parameters = []
+    for parameter in parameters:
         if not isinstance(parameter.default, (int, float)):
-            raise NsmError(f"activation {name!r}: {parameter.name} needs a number as its default")
-    defaults = {parameter.name: float(parameter.default) for parameter in settings}
-    _add("activation", name, ACTIVATIONS, elementwise(function, defaults))
-    _offer("activation", name, {"name": name, **defaults})
+            raise NsmError(
+                f"activation {name!r}: {parameter.name} needs a number as its default",
+                kind="missing_default",
+                key=name,
+            )
+    only = [p.replace(kind=p.KEYWORD_ONLY) for p in parameters]
+    make.__signature__ = inspect.Signature(only)  # type: ignore[attr-defined]
+    return make
 
 
-def register_encoding(name: str, kind: Callable[..., Encoding]) -> None:
+def register_encoding(name: str, kind: Callable[..., Any]) -> None:
     """Make an encoding known as ``encoding=NAME``: what the network sees of a point (u, v).
 
     Args:
         name: lower case letters, digits and underscores.
-        kind: called with 2, the dimension of Ω, and its settings, gives a module with
-            ``out_dim``, from points (N, 2) to features (N, out_dim), each row of its own point
-            alone. Its Jacobian is found by PyTorch, unless it has a method
-            ``value_and_jacobian_stack`` (see :class:`nsm.maps.SplineGrid`).
+        kind: called with its settings, gives a module with ``out_dim``, from points (N, 2) to
+            features (N, out_dim), each row from its own point alone. PyTorch finds its Jacobian,
+            unless it has a method ``value_and_jacobian_stack`` (see :class:`nsm.maps.SplineGrid`).
 
     Raises:
         NsmError: a name that is taken or no name.
     """
-    given = list(inspect.signature(kind).parameters.values())[1:]
-    settings = {p.name: p.default for p in given if p.default is not inspect.Parameter.empty}
-    _add("encoding", name, ENCODINGS, kind)
     # as for those of conf/: what has no grid to fit is trained from a random start
     start = {"override /initialization@_global_.initialization": "random"}
-    _offer("encoding", name, {"defaults": [start, "_self_"], "name": name, **settings})
+    _register("encoding", name, kind, {"defaults": [start, "_self_"]})
 
 
-def register_block(name: str, kind: Callable[[int, Activation], nn.Module]) -> None:
-    """Make a network known as ``map.block=NAME``: ``map.depth`` such blocks, one after the other.
+def register_block(name: str, kind: Callable[[int, nn.Module], nn.Module]) -> None:
+    """Make a network known as ``map.block=NAME``: ``map.depth`` such blocks in sequence.
 
     Between the encoding and the blocks stands a linear layer with the activation, behind them a
     linear layer.
@@ -104,7 +145,7 @@ def register_block(name: str, kind: Callable[[int, Activation], nn.Module]) -> N
     Args:
         name: lower case letters, digits and underscores.
         kind: called with ``map.width`` and the activation, gives a module (N, width) to
-            (N, width), each row of its own row alone. Its Jacobian is found by PyTorch.
+            (N, width), each row from its own row alone. PyTorch finds its Jacobian.
 
     Raises:
         NsmError: a name that is taken or no name.
@@ -117,8 +158,8 @@ def register_analytic(name: str, function: Callable[..., tuple[Tensor, Tensor, T
 
     Args:
         name: lower case letters, digits and underscores.
-        function: u (N,) and v (N,) to the three coordinates (N,), made of PyTorch's functions,
-            each point's of its own u and v alone; finite and smooth on Ω. Further arguments are
+        function: u (N,) and v (N,) to the three coordinates (N,), of PyTorch's functions, each
+            point from its own u and v alone; finite and smooth on Ω. Further arguments are
             parameters: ``target='{name: NAME, PARAMETER: VALUE}'``.
 
     Raises:
@@ -131,16 +172,47 @@ def register_analytic(name: str, function: Callable[..., tuple[Tensor, Tensor, T
     _add("analytic surface", name, ANALYTIC, partial(Formula, name, function))
 
 
+def _register(
+    group: str, name: str, make: Callable[..., Any], node: dict[str, Any] | None = None
+) -> None:
+    """Make ``GROUP=NAME`` an option, as a file of conf/ does, whose ``_target_`` is ``make``."""
+    _take(group, name, known=())
+
+    @functools.wraps(make)
+    def target(*args: Any, **kwargs: Any) -> Any:
+        return make(*args, **kwargs)
+
+    # its home is here, so that stored files that name it are trusted
+    target.__module__, target.__qualname__ = registered.__name__, name
+    setattr(registered, name, target)
+    store = {**(node or {}), "_target_": f"{registered.__name__}.{name}"}
+    ConfigStore.instance().store(group=group, name=name, node=store, provider="nsm")
+
+
 def _add(kind: str, name: str, table: MutableMapping[str, Any], thing: Any) -> None:
-    """Put a thing into a table; one of the user's own may be put there again, as notebooks do."""
-    if not _NAME.fullmatch(name):
-        raise NsmError(f"{kind} {name!r}: a name is lower case letters, digits and underscores")
-    if name in table and (kind, name) not in _OWN:
-        raise NsmError(f"{kind} {name!r} is there already; take another name")
+    _take(kind, name, table)
     table[name] = thing
-    _OWN.add((kind, name))
 
 
-def _offer(group: str, name: str, settings: Mapping[str, Any]) -> None:
-    """Make ``GROUP=NAME`` an option, as a file of conf/ does."""
-    ConfigStore.instance().store(group=group, name=name, node=dict(settings))
+def _take(kind: str, name: str, known: Any) -> None:
+    """Take a name for a kind; one that is taken for it may be registered again, as notebooks do."""
+    if not _NAME.fullmatch(name):
+        raise NsmError(
+            f"{kind} {name!r}: a name is lower case letters, digits and underscores",
+            kind="invalid_name",
+            key=name,
+        )
+    from nsm.config import conf_folder
+
+    builtin = (conf_folder() / kind / f"{name}.yaml").is_file() or name in known
+    if _KINDS.get(name, kind) != kind or (builtin and name not in _KINDS):
+        raise NsmError(
+            f"{kind} {name!r} exists already; take another name", kind="name_taken", key=name
+        )
+    _KINDS[name] = kind
+
+
+def _not_registered(name: str) -> Any:
+    raise AttributeError(
+        f"{name!r} is not registered in this process; if it is yours, call nsm.register_... first"
+    )

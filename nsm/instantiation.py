@@ -22,9 +22,8 @@ from nsm.errors import NotTrusted, NsmError
 
 # packages and modules whose classes only compute: making one reads and writes no file; loggers get
 # their folder from the run
-_LOGGERS = ("nsm.results.loggers",)
 _OURS = (
-    *("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", *_LOGGERS),
+    *("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.results.loggers"),
     *(f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map")),
 )
 _TORCH = ("torch.nn.modules.activation", "torch.optim")
@@ -70,13 +69,24 @@ def made_with(config: Mapping[str, Any], **offered: Any) -> Any:
     """
     target = str(config["_target_"])
     factory = made({**config, "_partial_": True})
-    names = inspect.signature(factory.func).parameters
+    names = _accepted(factory.func)
     given = {key: value for key, value in offered.items() if key in names and key not in config}
     try:
         return factory(**given)
     except (ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise NsmError(f"{target}: {reason}", kind="not_instantiable", key=target) from error
+
+
+def _accepted(target: Any) -> set[str]:
+    """Names of a target's parameters, with those of its bases where it takes ``**kwargs``."""
+    names: set[str] = set()
+    for kind in target.__mro__ if inspect.isclass(target) else (target,):
+        parameters = inspect.signature(kind.__init__ if inspect.isclass(kind) else kind).parameters
+        names |= set(parameters)
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            break
+    return names
 
 
 def is_trusted(target: str, trust: Iterable[str] = ()) -> bool:
@@ -125,9 +135,8 @@ def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
     """Refuse stored settings that would run code which is not to be trusted.
 
     Raises:
-        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within; a logger that names
-            its folder, or any positional arguments.
-        NsmError: ``interpolation``: a text with ``${``, which could become a target later.
+        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within.
+        NsmError: ``interpolation``: a text with ``${``, which may make a target of another text.
     """
     trust = _modules(trust)
     if OmegaConf.is_config(config):
@@ -136,10 +145,8 @@ def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
         message = f"{config[:80]!r} is an interpolation, which stored settings may not hold"
         raise NsmError(message, kind="interpolation")
     if isinstance(config, Mapping):
-        target = str(config.get("_target_", ""))
-        writes = _within(target, _LOGGERS) and "folder" in config  # anywhere on the disk
-        if "_args_" in config or writes or ("_target_" in config and not is_trusted(target, trust)):
-            raise NotTrusted(target)
+        if "_target_" in config and not is_trusted(str(config["_target_"]), trust):
+            raise NotTrusted(str(config["_target_"]))
         for item in config.items():
             check_trusted(item, trust)
     elif isinstance(config, (list, tuple)):

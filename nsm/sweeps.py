@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
@@ -54,10 +55,20 @@ class Outcome:
 OUTCOMES: list[Outcome] = []
 
 
-def overrides_of(words: Iterable[str], params: Mapping[str, Any] | None) -> list[Override]:
-    """The overrides of a sweep: its sweeper's ``params``, then the words, each key once."""
+def overrides_of(
+    arguments: Iterable[str],
+    params: Mapping[str, Any] | None,
+    loader: ConfigLoader | None = None,
+) -> list[Override]:
+    """The overrides of a sweep: its sweeper's ``params``, then the arguments, each key once.
+
+    Args:
+        arguments: of the command line.
+        params: of the sweeper.
+        loader: finds the options that ``GROUP=glob(*)`` stands for.
+    """
     texts = [f"{key}={value}" for key, value in (params or {}).items()]
-    parsed = OverridesParser.create().parse_overrides([*texts, *words])
+    parsed = OverridesParser.create(loader).parse_overrides([*texts, *arguments])
     return list({override.get_key_element(): override for override in parsed}.values())
 
 

@@ -1,13 +1,35 @@
-"""The command's first word: a command of its own, or the settings of a task."""
+"""The command: its first word, flags, and the answers to mistakes."""
 
+import json
 import sys
 import types
 from importlib.metadata import version
 
 import pytest
+from tiny import TRAINING
 
+import nsm
 from nsm import cli
 from nsm.arguments import Arguments
+
+SQUARE = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+DEFECTS = """
+import pytorch_lightning as pl
+
+class Broken:
+    def __init__(self, how="value"):
+        if how == "value":
+            raise ValueError("bad how")
+        if how == "defect":
+            raise ZeroDivisionError("a defect")
+
+    def __call__(self, source, target):
+        return (target - source).square().sum(dim=(-2, -1))
+
+class Callback(pl.Callback):
+    def on_train_start(self, trainer, module):
+        raise KeyError("missing")
+"""
 
 
 @pytest.fixture
@@ -15,10 +37,10 @@ def echo(monkeypatch):
     """A command ``echo FOLDER`` in the table; what it was called with."""
     seen: list[str] = []
 
-    def main(words: list[str]) -> None:
+    def main(arguments: list[str]) -> None:
         parser = Arguments(prog="nsm echo")
         parser.add_argument("folder")
-        seen.append(parser.parse_args(words).folder)
+        seen.append(parser.parse_args(arguments).folder)
 
     module = types.ModuleType("echo_command")
     module.main = main
@@ -27,44 +49,108 @@ def echo(monkeypatch):
     return seen
 
 
-def test_a_command_gets_the_words_after_its_name(echo, here):
+@pytest.fixture
+def defects(tmp_path, monkeypatch):
+    """The user's module ``defects_for_test`` in the current folder."""
+    (tmp_path / "defects_for_test.py").write_text(DEFECTS)
+    (tmp_path / "patch.off").write_text(SQUARE)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield
+    sys.modules.pop("defects_for_test", None)
+
+
+def test_a_command_gets_the_arguments_after_its_name(echo, here):
     result = here("echo", "runs")
     assert (result.returncode, echo) == (0, ["runs"])
 
 
 def test_a_mistaken_command_line_is_one_line_and_status_2(echo, here):
     result = here("echo", "runs", "--loud")
-    assert result.returncode == 2
-    assert result.stderr.strip().splitlines() == [
-        "nsm: unrecognized arguments: --loud; see nsm echo --help"
-    ]
-    assert echo == []
-
-
-def test_other_words_are_settings(echo, here):
-    result = here("eco")
-    assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1
+    assert (result.returncode, len(result.stderr.splitlines()), echo) == (2, 1, [])
+    assert "--loud" in result.stderr
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("arguments", "named"),
     [
-        (["--foo"], "--foo: no flag is called so"),
-        (["-m", "--foo", "seed=1,2"], "--foo: no flag is called so"),
-        (["seed=1", "-m", "domain=disc,square"], "domain=disc,square: give flags, such as -m, bef"),
+        (["eco"], "eco"),
+        (["--foo"], "--foo"),
+        (["-m", "--foo", "seed=1,2"], "--foo"),
         (["--cfg", "jobs"], "'jobs'"),
         (["--resolve"], "--cfg job"),
-        (["--experimental-rerun", "gone.pickle"], "nsm resume=FOLDER"),
-        (["-m", "--cfg", "job"], "exclude each other"),
+        (["--experimental-rerun", "gone.pickle"], "--experimental-rerun"),
+        (["-m", "--cfg", "job"], "--cfg"),
+        (["lambda.foo=2"], "loss_weights.foo"),
+        (["surface=/nowhere/mesh.obj"], "/nowhere/mesh.obj"),
+        (["nowhere.obj"], "nowhere.obj"),
+        (["logger=3"], "int"),
+        (["resume=nowhere", "seed=1"], "seed=1"),
     ],
 )
-def test_a_mistaken_flag_is_told_in_one_line(here, words, told):
-    result = here(*words)
+def test_a_mistake_is_one_line(here, arguments, named):
+    result = here(*arguments)
     assert (result.returncode, result.stdout) == (2, "")
-    assert told in result.stderr
+    assert named in result.stderr
     assert len(result.stderr.splitlines()) == 1
+
+
+def test_flags_may_stand_anywhere(here):
+    result = here("seed=1", "--cfg", "job", "trainer.max_steps=3")
+    assert result.returncode == 0 and "max_steps: 3" in result.stdout
+
+
+def test_the_flags_of_hydra_are_known(here):
+    listed = here("--hydra-help").stdout
+    for names in cli._HYDRA_FLAGS:
+        assert names[0] in listed
 
 
 def test_the_version_is_ours(here):
     assert here("--version").stdout == f"nsm {version('nsm')}\n"
+
+
+def test_a_mesh_file_is_enough(here, tmp_path):
+    (tmp_path / "my mesh (1).off").write_text(SQUARE)
+    training = [setting for setting in TRAINING if not setting.startswith("surface.path")]
+    result = here("my mesh (1).off", *training, "hydra.run.dir=run", "logger=none")
+    assert result.returncode == 0, result.stderr
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "status", "named"),
+    [
+        (["energy.how=value"], 2, "ValueError"),
+        (["energy.how=defect"], 1, "ZeroDivisionError"),
+        (["energy=arap", "callbacks.mine._target_=defects_for_test.Callback"], 1, "KeyError"),
+    ],
+)
+def test_defects_of_the_users_code(here, defects, settings, status, named):
+    settings = ["task=param", "energy._target_=defects_for_test.Broken", *settings]
+    if "energy=arap" in settings:
+        settings = ["task=overfit", *TRAINING, "logger=none", settings[-1]]
+    short = here(*settings)
+    assert (short.returncode, len(short.stderr.splitlines())) == (status, 1)
+    assert "defects_for_test.py:" in short.stderr and "--debug" in short.stderr
+    full = here("--debug", *settings)
+    assert full.returncode == status
+    assert f"{named}: " in full.stderr and "Traceback" in full.stderr
+    assert full.stderr.splitlines()[-1] == short.stderr.strip()
+
+
+def test_classes_of_the_current_folder_and_other_libraries(here, defects, tmp_path):
+    result = here(
+        *TRAINING,
+        "hydra.run.dir=run",
+        "optimizer._target_=torch.optim.NAdam",
+        "activation._target_=torch.nn.Mish",
+        "+callbacks.mine._target_=pytorch_lightning.callbacks.Timer",
+        "logger=csv",
+    )
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "run" / "csv" / "metrics.csv").is_file()
+
+
+def test_public_names_are_listed():
+    assert set(nsm.__all__) <= set(dir(nsm))
+    assert all(getattr(nsm, name) is not None for name in nsm.__all__)

@@ -1,79 +1,160 @@
-"""The configuration: every file composes, and mistakes are told in one line."""
+"""The configuration: every option composes and can be made, and mistakes are named."""
 
-import inspect
+import random
+import sys
+import types
+from importlib import import_module
 
+import hydra
+import numpy as np
 import pytest
 import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
 
-from nsm.config import compose_config, conf_folder, known_keys
-from nsm.config_validation import TASK_CHOICES, named
-from nsm.errors import NsmError
-from nsm.pipeline import TASKS
+from nsm.config import checked, compose_config, composed, conf_folder, read_config
+from nsm.config_docs import known_keys
+from nsm.domains import Surface
+from nsm.errors import NotTrusted, NsmError
+from nsm.instantiation import check_trusted, made
+from nsm.migration import OPTIONS, RENAMED
+from nsm.settings import Settings, parameters
 from nsm.surfaces import catalogue_names
 
 FILES = sorted(
-    (str(file.parent.relative_to(conf_folder())), file.stem)
+    (file.parent.relative_to(conf_folder()).as_posix(), file.stem)
     for file in conf_folder().rglob("*.yaml")
     if file.parent != conf_folder()
 )
-# what an option of these groups means depends on the task
-FOR_TASK = {
-    "energy": lambda name: "overfit" if name == "overfit" else "param",
-    "constraints": lambda name: "param" if name == "param" else "pair_map",
-    "loss_weights": lambda name: {"param": "param"}.get(
-        name, "pair_map" if "pair" in name else "overfit"
-    ),
-    "experiment": lambda name: "pair_map" if name == "paper_pair" else "overfit",
+# the task that an option is for, if it is not for all
+TASKS = {
+    ("loss_weights", "param"): "param",
+    ("loss_weights", "pair"): "pair_map",
+    ("loss_weights", "paper_pair"): "pair_map",
+    ("constraints", "param"): "param",
+    ("constraints", "pair"): "pair_map",
+    ("constraints", "paper_pair"): "collection_map",
+    ("experiment", "paper_pair"): "pair_map",
+    ("data", "collection"): "collection_map",
 }
 
 
+@pytest.fixture
+def mine(monkeypatch):
+    """A module of the user's, ``mine_for_test``."""
+    module = types.ModuleType("mine_for_test")
+
+    class Energy:
+        """An energy.
+
+        Args:
+            power: what the stretch is raised to.
+        """
+
+        def __init__(self, power: float = 1.0, *, sign: int = 1) -> None:
+            if power == 13:
+                raise RuntimeError("a defect")
+            self.power = power
+
+        def __call__(self, source, target):
+            return torch.linalg.det(target) ** self.power
+
+    class Term:
+        def __init__(self, margin: float = 0.5) -> None:
+            self.margin = margin
+
+    for kind in (Energy, Term):
+        kind.__module__, kind.__qualname__ = module.__name__, kind.__name__
+        setattr(module, kind.__name__, kind)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    return module
+
+
 @pytest.mark.parametrize(("group", "name"), FILES)
-def test_every_file_composes(group, name, monkeypatch):
-    monkeypatch.setattr("nsm.config_validation.require", lambda kind: None)  # packages of loggers
-    task = FOR_TASK.get(group, lambda name: "overfit")(name)
-    words = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
-    config = compose_config(words)
-    assert config.domain == ("square" if name == "square" else "disc")
-    if group in named():
-        assert config[group].name in named()[group]
+def test_every_option_composes_and_is_made(group, name):
+    task = TASKS.get((group, name), "param" if group == "energy" else "overfit")
+    overrides = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
+    config = compose_config(overrides)  # which makes network, optimizer, scheduler and more
+    if group in ("energy", "domain", "sampler"):
+        assert made(config[group]) is not None
+    if group.startswith("hydra/"):
+        made(OmegaConf.load(conf_folder() / group / f"{name}.yaml"))
 
 
-def test_every_known_choice_is_an_option():
-    """Nothing that the code offers is out of reach of GROUP=OPTION."""
-    for group, known in named().items():
-        options = [name for g, name in FILES if g == group]
-        assert {compose_config([f"{group}={o}"])[group].name for o in options} == set(known)
-    assert set(TASK_CHOICES) == set(TASKS) == {name for g, name in FILES if g == "task"}
+def test_an_option_repeats_no_default():
+    for group, name in FILES:
+        node = yaml.safe_load((conf_folder() / group / f"{name}.yaml").read_text()) or {}
+        if node.get("_target_", "").startswith("nsm."):  # torch's may change
+            module, _, kind = node["_target_"].rpartition(".")
+            known = parameters(getattr(import_module(module), kind))[0]
+            for key in set(node) & set(known):
+                default = known[key].default
+                assert node[key] != (list(default) if isinstance(default, tuple) else default)
 
 
-def test_optimizers_take_what_torch_takes():
-    assert set(named()["optimizer"]["sgd"]) == {
-        *inspect.signature(torch.optim.SGD).parameters,
-        "encoding_lr",
-    } - {"params"}
+def test_what_is_completed_is_not_changed_again():
+    for task in ("overfit", "param", "pair_map", "collection_map"):
+        config = compose_config([f"task={task}"])
+        assert checked(config) == config
 
 
-def test_the_check_leaves_no_trace_in_the_random_numbers():
+def test_the_check_leaves_the_random_numbers():
     torch.manual_seed(1)
-    expected = torch.rand(3)
+    np.random.seed(1)
+    random.seed(1)
+    expected = torch.rand(3), np.random.rand(), random.random()
     torch.manual_seed(1)
+    np.random.seed(1)
+    random.seed(1)
     compose_config(["map=residual"])
-    assert torch.equal(torch.rand(3), expected)
+    assert torch.equal(torch.rand(3), expected[0])
+    assert (np.random.rand(), random.random()) == expected[1:]
 
 
-def test_groups_can_be_changed_apart():
+def test_the_callers_hydra_is_left(tmp_path):
+    (tmp_path / "theirs.yaml").write_text("a: 1\n")
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        theirs = GlobalHydra.instance().hydra
+        compose_config(["activation=silu"])
+        with pytest.raises(NsmError):
+            compose_config(["activation=sillu"])
+        assert GlobalHydra.instance().hydra is theirs
+        assert compose("theirs").a == 1
+    compose_config([])
+    assert not GlobalHydra.instance().is_initialized()
+
+
+def test_it_composes_within_the_callers_hydra_main(tmp_path, monkeypatch):
+    (tmp_path / "theirs.yaml").write_text("a: 1\nhydra: {run: {dir: .}, output_subdir: null}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["theirs", "a=2"])
+    seen = []
+
+    @hydra.main(config_path=str(tmp_path), config_name="theirs", version_base="1.3")
+    def main(config):
+        seen.append((compose_config(["seed=3"]).seed, config.a))
+        seen.append(hydra.core.hydra_config.HydraConfig.get().overrides.task[0])
+
+    main()
+    assert seen == [(3, 2), "a=2"]
+
+
+def test_groups_can_be_changed_separately():
     config = compose_config(["task=pair_map", "data=paper", "loss_weights=paper_pair"])
-    assert (config.data.batch_size, config.data.pool) == (4000, 500_000)
+    assert (config.data.batch_size, config.sampler.pool) == (4000, 500_000)
     assert config.constraints.boundary == "exact"
-    assert config.constraints.lambda_seam == 0
+    assert config.loss_weights.seam == 0
     config = compose_config(["task=pair_map", "data=paper", "sampler=fresh", "domain=square"])
-    assert (config.data.batch_size, config.data.pool, config.domain) == (4000, None, "square")
+    assert (config.data.batch_size, config.sampler.pool) == (4000, None)
+    assert config.domain._target_ == "nsm.domains.Square"
     config = compose_config(["task=pair_map", "constraints=paper_pair", "loss_weights=pair"])
-    assert (config.constraints.boundary, config.constraints.lambda_seam) == ("penalty", 1e3)
+    assert (config.constraints.boundary, config.loss_weights.seam) == ("penalty", 1e3)
 
 
 @pytest.mark.parametrize(
-    ("words", "linear_skip", "steps"),
+    ("overrides", "linear_skip", "steps"),
     [
         ([], "fitted", 1000),
         (["map=residual"], "fitted", 1000),
@@ -87,112 +168,381 @@ def test_groups_can_be_changed_apart():
         (["task=pair_map", "encoding=fourier"], "none", 1500),
     ],
 )
-def test_only_what_can_be_fitted_starts_so(words, linear_skip, steps):
-    """What has no grid to fit, or no surface, starts at random, at full rates."""
-    config = compose_config(words)
+def test_only_a_grid_and_a_surface_can_be_fitted(overrides, linear_skip, steps):
+    config = compose_config(overrides)
     assert (config.map.linear_skip, config.trainer.max_steps) == (linear_skip, steps)
     assert config.scheduler.get("peak", 1.0) == (0.003 if linear_skip == "fitted" else 1.0)
 
 
 def test_the_surface_group_is_the_catalogue():
-    files = {name for group, name in FILES if group == "surface"} - {"base"}
+    files = {name for group, name in FILES if group == "surface"}
     assert files == set(catalogue_names())
     for name in files:
-        assert compose_config([f"surface={name}"]).surface.name == name
+        assert composed([f"surface={name}"])[0].surface.name == name
 
 
 def test_paper_settings_are_those_of_the_paper():
     config = compose_config(["experiment=paper"])
     assert (config.map.width, config.map.depth, config.map.block) == (256, 10, "post")
     assert config.map.initialization == "xavier"
-    assert dict(config.activation) == {"name": "softplus", "beta": 1.0}
-    assert config.encoding.name == "identity"
-    assert config.energy.lambda_normal == 0.01
-    assert (config.optimizer.name, config.optimizer.lr) == ("rmsprop", 1e-4)
+    assert dict(config.activation) == {"_target_": "nsm.maps.activations.Softplus", "beta": 1.0}
+    assert config.encoding._target_ == "nsm.maps.encodings.Identity"
+    assert config.loss_weights.normal == 0.01
+    assert (config.optimizer._target_, config.optimizer.lr) == ("torch.optim.RMSprop", 1e-4)
     assert config.optimizer.momentum == 0.9
-    assert config.scheduler.name == "sgdr"
-    assert (config.data.batch_size, config.data.pool) == (4000, 500_000)
+    assert config.scheduler._target_ == "nsm.tasks.schedules.SGDR"
+    assert (config.data.batch_size, config.sampler.pool) == (4000, 500_000)
     assert config.trainer.stop_gradient_norm == 0.1
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("overrides", "kind", "key"),
     [
-        ("trainer.max_step=10", "'trainer.max_steps'"),
-        ("+trainer.max_step=10", "'trainer.max_steps'"),
-        ("activaton=silu", "'activation'"),
-        ("activation=sillu", "'silu'"),
-        ("surface=bunnny", "'bunny'"),
-        ("domain=squre", "'square'"),
-        ("loss_weights=positons", "'positions'"),
-        ("trainer.max_steps=many", "trainer.max_steps"),
-        ("trainer.accelerator=gppu", "'gpu'"),
-        ("data.batch_size=0", "data.batch_size"),
-        ("data.vertex_share=2", "data.vertex_share"),
-        ("data.domain_share=0.95", "data.domain_share"),
-        ("trainer.precision=half", "float32, tf32, bf16"),
-        ("trainer.max_steps=[", "trainer.max_steps=["),
-        ("map.block=pots", "'post'"),
-        ("surface.parameterization=slimm", "'slim'"),
-        ("phi.overrides=['map.widht=3']", "'map.width'"),
-        # inside the groups whose keys depend on the choice
-        ("activation.bta=3", "'beta'"),
-        ("+activation.bta=3", "'beta'"),
-        ("activation=relu +activation.beta=3", "takes no such setting"),
-        ("activation.beta=soft", "not a number"),
-        ("encoding.feature=4", "'features'"),
-        ("encoding.features=2.5", "not a whole number"),
-        ("encoding.resolutions=[]", "one level or more"),
-        ("encoding.resolutions=[8,0]", "1 cell or more"),
-        ("encoding.extent=0", "must be positive"),
-        ("encoding.extent=nan", "no finite number"),
-        ("optimizer.encoding_lr=-1", "negative"),
-        ("scheduler.warmup=-1", "negative"),
-        ("seed=-1", "not at least 0"),
-        ("seed=4294967296", "more than"),
-        ("data.pool=0", "not at least 1"),
-        ("data.steps_per_epoch=9223372036854775808", "too large"),
-        ("encoding.resolutions=[16,many]", "each item a whole number"),
-        ("encoding.degree=7", "degree 2 or 3"),
-        ("+optimizer.weight_decy=0.1", "'weight_decay'"),
-        ("optimizer=rmsprop optimizer.momentun=0.1", "'momentum'"),
-        ("optimizer.momentum=0.1", "optimizer=adam takes no such setting"),
-        ("optimizer.weight_decay=0.1", "+optimizer.weight_decay=0.1"),
-        ("optimizer.lr=fast", "not a number"),
-        ("optimizer.betas=[2,3]", "setting optimizer: "),
-        ("scheduler=sgdr scheduler.periode=9", "'period'"),
-        ("scheduler=sgdr scheduler.period=0", "positive"),
-        ("energy.lambda_norml=1", "'lambda_normal'"),
-        ("energy=conformal", "task=overfit takes no such setting"),
-        ("constraints=pair", "task=overfit has none"),
-        ("task=param +energy.weights.arpa=1", "'area'"),
-        ("task=param energy.weights.symmetric_dirichlet=[]", "not a number"),
-        ("task=param constraints.bondary=fixed", "'boundary'"),
-        ("task=param constraints.boundary=fixd", "'fixed'"),
-        ("task=pair_map constraints.ramp=3", "constraints.ramp"),
-        ("task=pair_map constraints.multiplier_every=often", "not a whole number"),
-        ("task=pair_map loss_weights=param", "constraints.lambda_boundary"),
-        ("+optimizer.lr=1", "leave out the +"),
+        ("trainer.max_step=10", "unknown_setting", "trainer.max_step"),
+        ("+trainer.max_step=10", "unknown_setting", "trainer.max_step"),
+        ("activaton=silu", "unknown_setting", "activaton"),
+        ("activation=sillu", "unknown_option", "activation"),
+        ("surface=bunnny", "unknown_option", "surface"),
+        ("domain=squre", "unknown_option", "domain"),
+        ("trainer.max_steps=many", "wrong_type", "trainer.max_steps"),
+        ("trainer.accelerator=gppu", "unknown_option", "trainer.accelerator"),
+        ("trainer.precision=half", "unknown_option", "trainer.precision"),
+        ("data.batch_size=0", "out_of_range", "data.batch_size"),
+        ("sampler.vertex_share=2", "out_of_range", None),
+        ("sampler.domain_share=0.95", "out_of_range", "sampler.domain_share"),
+        ("trainer.max_steps=[", "unreadable_setting", "trainer.max_steps=["),
+        ("eco", "unreadable_setting", "eco"),
+        ("seed=1,2", "several_values", "seed"),
+        ("+seed=1", "already_set", "seed"),
+        ("surface.parameterization=slimm", "unknown_option", "surface.parameterization"),
+        ("phi.overrides=['map.widht=3']", "unknown_setting", "map.widht"),
+        ("activation.bta=3", "unknown_setting", "activation.bta"),
+        ("+activation.bta=3", "unknown_setting", "activation.bta"),
+        ("activation=relu activation.beta=3", "unknown_setting", "activation.beta"),
+        ("activation.beta=soft", "wrong_type", "activation.beta"),
+        ("encoding.feature=4", "unknown_setting", "encoding.feature"),
+        ("encoding.features=2.5", "wrong_type", "encoding.features"),
+        ("encoding.resolutions=[]", None, "encoding"),
+        ("encoding.resolutions=[8,0]", None, "encoding"),
+        ("encoding.resolutions=[16,many]", "wrong_type", "encoding.resolutions"),
+        ("encoding.extent=0", None, "encoding"),
+        ("encoding.extent=nan", "out_of_range", "encoding.extent"),
+        ("encoding.degree=7", None, "encoding"),
+        ("activation=sine activation.omega=0 map.initialization=siren", None, None),
+        ("seed=-1", "out_of_range", "seed"),
+        ("seed=4294967296", "out_of_range", "seed"),
+        ("data.steps_per_epoch=9223372036854775808", "out_of_range", "data.steps_per_epoch"),
+        ("optimizer.encoding_lr=-1", "out_of_range", "optimizer"),
+        ("optimizer=rmsprop optimizer.momentun=0.1", "unknown_setting", "optimizer.momentun"),
+        ("optimizer.momentum=0.1", "unknown_setting", "optimizer.momentum"),
+        ("optimizer.lr=fast", "wrong_type", "optimizer.lr"),
+        ("optimizer.betas=[2,3]", "not_instantiable", "optimizer"),
+        ("optimizer._target_=torch.optim.Nadam", "not_importable", "optimizer._target_"),
+        ("optimizer._target_=torch.pi", "wrong_type", "optimizer._target_"),
+        ("scheduler=sgdr scheduler.periode=9", "unknown_setting", "scheduler.periode"),
+        ("scheduler=sgdr scheduler.period=0", "out_of_range", "scheduler.period"),
+        ("scheduler=sgdr scheduler.period_factor=0.5", "out_of_range", "scheduler.period_factor"),
+        ("scheduler.warmup=-1", "out_of_range", "scheduler.warmup"),
+        ("loss_weights.normall=1", "unknown_setting", "loss_weights.normall"),
+        ("loss_weights=pair", "unknown_setting", "loss_weights.injectivity"),
+        ("constraints=pair", "unknown_setting", "constraints"),
+        ("task=param constraints.bondary=fixed", "unknown_setting", "constraints.bondary"),
+        ("task=param constraints.boundary=fixd", "unknown_option", "constraints.boundary"),
+        ("task=pair_map constraints.ramp=3", "out_of_range", "constraints.ramp"),
+        ("task=pair_map constraints.multiplier_every=often", "wrong_type", None),
+        ("task=pair_map loss_weights=param", "missing_setting", "loss_weights.boundary"),
+        ("task=param energy=null", None, None),
+        ("callbacks.mine.patience=3", "missing_setting", "callbacks.mine"),
+        (
+            "loss_terms.mine._target_=mine_for_test.Term",
+            "missing_setting",
+            "loss_terms.mine.weight",
+        ),
+        ("task=param energy._target_=mine_for_test.Energy energy.pwer=3", "unknown_setting", None),
+        ("task=param energy._target_=mine_for_test.Energy energy.power=x", "wrong_type", None),
+        ("task=param energy._target_=mine_for_test.Enrgy", "not_importable", "energy._target_"),
     ],
 )
-def test_mistakes_are_one_line_that_helps(words, expected):
+def test_a_mistake_is_one_line_with_kind_and_key(overrides, kind, key, mine):
     with pytest.raises(NsmError) as error:
-        compose_config(words.split())
-    assert "\n" not in str(error.value)
-    assert expected in str(error.value)
+        compose_config(overrides.split())
+    assert len(str(error.value).splitlines()) == 1
+    assert kind is None or error.value.kind == kind
+    assert key is None or error.value.key.startswith(key)
 
 
-def test_misspelt_keys_of_ones_own_files_are_told(tmp_path, here):
-    (tmp_path / "conf" / "experiment").mkdir(parents=True)
-    file = tmp_path / "conf" / "experiment" / "mine.yaml"
-    file.write_text("# @package _global_\ntrainer:\n  max_stepz: 3\n")
+def test_a_mistake_names_the_nearest():
+    for override, near in (
+        ("trainer.max_step=10", "'max_steps'"),
+        ("activaton=silu", "'activation'"),
+        ("activation=sillu", "'silu'"),
+        ("optimizer._target_=torch.optim.Nadam", "torch.optim.NAdam"),
+        ("trainer.acelerator=gpu", "'accelerator'"),
+    ):
+        with pytest.raises(NsmError) as error:
+            compose_config([override])
+        assert near in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "expected"),
+    [
+        ("optimizer._target_=torch.optim.NAdam", "optimizer.betas", [0.9, 0.99]),
+        ("optimizer._target_=torch.optim.SGD", "optimizer.betas", None),
+        ("optimizer.weight_decay=1", "optimizer.weight_decay", 1.0),
+        ("+optimizer.weight_decay=1", "optimizer.weight_decay", 1.0),
+        ("activation._target_=torch.nn.Mish", "activation.beta", None),
+        ("activation._target_=torch.nn.CELU activation.alpha=2", "activation.alpha", 2.0),
+        (
+            "scheduler._target_=torch.optim.lr_scheduler.StepLR scheduler.step_size=5",
+            "scheduler.step_size",
+            5,
+        ),
+        ("task=param energy._target_=mine_for_test.Energy", "energy.power", None),
+        ("task=param energy._target_=mine_for_test.Energy energy.power=2", "energy.power", 2.0),
+        (
+            "+callbacks.mine._target_=pytorch_lightning.callbacks.EarlyStopping "
+            "+callbacks.mine.monitor=val/rms",
+            "callbacks.mine.monitor",
+            "val/rms",
+        ),
+        (
+            "+loss_terms.mine._target_=mine_for_test.Term +loss_terms.mine.weight=1",
+            "loss_terms.mine.weight",
+            1.0,
+        ),
+        (
+            "logger.mine._target_=pytorch_lightning.loggers.CSVLogger logger.mine.save_dir=x",
+            "logger.mine.save_dir",
+            "x",
+        ),
+        ("task=pair_map constraints.multiplier_every=7", "constraints.multiplier_every", 7),
+        ("trainer.gradient_clip=1", "trainer.gradient_clip", 1.0),
+    ],
+)
+def test_any_class_works_from_the_command_line(overrides, key, expected, mine):
+    assert OmegaConf.select(compose_config(overrides.split()), key) == expected
+
+
+def test_a_defect_of_the_users_code_passes(mine):
+    with pytest.raises(RuntimeError):
+        compose_config(["task=param", "energy._target_=mine_for_test.Energy", "energy.power=13"])
+
+
+@pytest.mark.parametrize(
+    "name", ["a b.obj", "a=b.obj", "it's.obj", 'a "b".obj', "a(1),b.obj", "a\\b.obj", "ü{1}.obj"]
+)
+def test_paths_with_special_signs(name):
+    for override in (name, f"surface={name}", f"surface.path={name}", f"surface=/x/{name}"):
+        if "," in name and override == f"surface={name}":
+            continue  # two files, for a sweep
+        if "=" in name and override == name:
+            continue  # a setting
+        path = composed([override])[0].surface.path
+        assert path == (f"/x/{name}" if "/x/" in override else name)
+    assert composed(["surface=cow"])[0].surface.path is None
+
+
+@pytest.mark.parametrize("old", [*RENAMED, *OPTIONS, ("optimizer.name", "adam")])
+def test_an_old_name_is_answered_with_the_new_one(old):
+    key, value = old if isinstance(old, tuple) else (old, "1")
+    with pytest.raises(NsmError) as error:
+        compose_config([f"{key}={value}"])
+    assert (error.value.kind, error.value.key) == ("renamed_setting", key)
+    if not isinstance(old, tuple):
+        with pytest.raises(NsmError) as error:
+            compose_config([f"+{old}.foo=2"])
+        assert f"{RENAMED[old]}.foo=2" in str(error.value)
+
+
+def test_new_names_exist():
+    known = set(known_keys())
+    for new in RENAMED.values():
+        group = new.partition(".")[0]
+        assert new in known or group in known
+    for group, name in OPTIONS.values():
+        assert (group, name) in FILES
+
+
+V1 = """
+task: {name: TASK}
+phi: {path: null, overrides: []}
+surface: {path: null, name: cow, seam_vertices: null, parameterization: slim, cache: true}
+source: null
+target: null
+surfaces: null
+landmarks: null
+attributes: {source: null, target: null}
+seam: {path: auto, landmarks: null}
+guarantee: {repair: true, rounds: 3}
+map: {width: 64, depth: 1, block: plain, initialisation: kaiming, readout: none}
+activation: {name: softplus, beta: 10.0}
+encoding: {name: spline_grid, resolutions: [8, 32], features: 4, degree: 2, extent: 1.05}
+energy: ENERGY
+constraints: CONSTRAINTS
+data: {batch_size: 64, steps_per_epoch: 5, vertex_share: 0.25, domain_share: 0.0, pool: null,
+       held_out: 128}
+optimizer: {name: adam, lr: 0.003, encoding_lr: 0.03, betas: [0.9, 0.99], eps: 1.0e-12}
+scheduler: {name: cosine, warmup: 100, final: 0.0, peak: 0.003}
+trainer: {max_steps: 1000, accelerator: auto, devices: 1, stop_gradient_norm: null,
+          stop_window: 100, threads: 1, gradient_clip: null, progress: true, precision: float32,
+          compile: false}
+logger: {kinds: [tensorboard, csv], every: 10, pictures: 3, project: nsm, uri: null}
+domain: square
+seed: 7
+artefacts: true
+resume: null
+"""
+LAMBDAS = ("injectivity", "boundary", "landmarks", "seam", "triangles")
+
+
+@pytest.mark.parametrize("task", ["overfit", "param", "pair_map", "collection_map"])
+def test_the_configuration_of_an_older_run_is_read(task, tmp_path):
+    names = {"overfit": (), "param": (LAMBDAS[0], LAMBDAS[-1])}.get(task, LAMBDAS)
+    held = {f"lambda_{name}": 2.0 for name in names}
+    if task == "param":
+        held["boundary"] = "free"
+    elif task != "overfit":
+        held.update(boundary="exact", landmarks="augmented", multiplier_every=50, ramp=0.5)
+    energy = {"lambda_normal": 0.5} if task == "overfit" else {"weights": {"arap": 2.0}}
+    text = V1.replace("TASK", task).replace("ENERGY", str(energy))
+    (tmp_path / "config.yaml").write_text(text.replace("CONSTRAINTS", str(held or "null")))
+    config = checked(read_config(tmp_path / "config.yaml"))
+    check_trusted(OmegaConf.to_container(config))
+    assert (config.task.name, config.seed, config.surface.name) == (task, 7, "cow")
+    assert config.domain._target_ == "nsm.domains.Square"
+    assert dict(config.activation) == {"_target_": "nsm.maps.activations.Softplus", "beta": 10.0}
+    assert (config.map.linear_skip, config.map.initialization) == ("none", "kaiming")
+    assert (config.sampler.vertex_share, config.data.batch_size) == (0.25, 64)
+    assert config.certification.rounds == 3
+    assert (config.trainer.log_every, config.trainer.log_pictures) == (10, 3)
+    assert set(config.logger) == {"tensorboard", "csv"}
+    expected = dict.fromkeys(names, 2.0) if names else {"normal": 0.5}
+    assert dict(config.loss_weights) == expected
+    if task != "overfit":
+        assert made(config.energy) is not None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a",
+        "[1, 2]",
+        "task: {name: overfit}",
+        "task: &a {name: overfit}",
+        "task: !!python/object:os.system {}",
+        "seed: ${oc.env:HOME}",
+        "task: {_target_: a",
+        V1.replace("{name: softplus, beta: 10.0}", "3").replace("TASK", "overfit"),
+    ],
+)
+def test_a_file_that_is_no_configuration_is_refused(text, tmp_path):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(NsmError) as error:
+        read_config(tmp_path / "config.yaml")
+    assert (error.value.kind, error.value.key) == ("damaged_file", str(tmp_path / "config.yaml"))
+
+
+def test_a_stored_target_of_others_is_refused(tmp_path):
+    file = tmp_path / "config.yaml"
+    config = compose_config(["activation._target_=torch.nn.Mish"])
+    check_trusted(OmegaConf.to_container(config))
+    for target in (
+        "os.system",
+        "subprocess.Popen",
+        "nsm.cli.main",
+        "torch.hub.load",
+        "mine.Energy",
+    ):
+        config.activation = {"_target_": target}
+        file.write_text(OmegaConf.to_yaml(config))
+        stored = OmegaConf.to_container(read_config(file))
+        with pytest.raises(NotTrusted) as error:
+            check_trusted(stored)
+        assert error.value.key == target.split(".")[0]
+    check_trusted(stored, trust=["mine"])
+
+
+def test_a_users_own_files(tmp_path, here):
+    folder = tmp_path / "conf"
+    for group in ("experiment", "optimizer"):
+        (folder / group).mkdir(parents=True)
+    experiment = folder / "experiment" / "mine.yaml"
+    experiment.write_text("# @package _global_\ntrainer:\n  max_stepz: 3\n")
     result = here("--config-dir=conf", "experiment=mine")
-    assert result.returncode == 2
-    assert "'trainer.max_steps'" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
+    assert "'max_steps'" in result.stderr
+    experiment.write_text(
+        "# @package _global_\ndefaults:\n  - override /optimizer: mine\ntrainer: {max_steps: 3}\n"
+    )
+    (folder / "optimizer" / "mine.yaml").write_text("_target_: torch.optim.NAdam\nlr: 0.5\n")
+    result = here("--config-dir=conf", "--cfg", "job", "experiment=mine")
+    config = yaml.safe_load(result.stdout)
+    assert config["optimizer"] == {"_target_": "torch.optim.NAdam", "lr": 0.5}
+    assert config["trainer"]["max_steps"] == 3
 
 
 def test_known_keys_are_dotted():
-    assert {"trainer.max_steps", "activation", "domain", "constraints.lambda_seam"} <= set(
-        known_keys()
+    assert {"trainer.max_steps", "activation", "domain", "loss_weights.seam"} <= set(known_keys())
+    assert set(parameters(Settings)[0]) - {"surface"} <= {k.partition(".")[0] for k in known_keys()}
+
+
+class TestFunctions:
+    """Settings as arguments of the functions of nsm."""
+
+    @pytest.fixture
+    def request_of(self):
+        from nsm.api import _Request
+
+        uv = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1], [0, 0]])
+        faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+        surface = Surface.from_arrays(np.column_stack([uv, 0 * uv[:, 0]]), faces, cache=False)
+
+        def call(overrides=(), **settings):
+            request = _Request("overfit", overrides, settings, [surface])
+            with request.run(None, False) as (config, _):
+                return config
+
+        return call
+
+    def test_they_are_as_on_the_command_line(self, request_of, mine):
+        config = request_of(
+            ["data.batch_size=32"],
+            activation="silu",
+            trainer={"max_steps": 5},
+            seed=3,
+            experiment="quick",
+            optimizer=torch.optim.NAdam,
+            loss_terms={"mine": {"_target_": mine.Term, "weight": 2}},
+        )
+        assert config.activation._target_.endswith("SiLU")
+        assert (config.trainer.max_steps, config.seed, config.data.batch_size) == (5, 3, 32)
+        assert config.optimizer._target_.endswith("NAdam")
+        assert config.loss_terms.mine == {
+            "_target_": "mine_for_test.Term",
+            "weight": 2.0,
+        }
+        assert config.trainer.progress is False and config.logger == {}
+
+    @pytest.mark.parametrize(
+        ("overrides", "settings", "kind", "key"),
+        [
+            ([], {"activaton": "silu"}, "unknown_setting", "activaton"),
+            ([], {"activation": "sillu"}, "unknown_option", "activation"),
+            ([], {"trainer": {"max_step": 3}}, "unknown_setting", "trainer.max_step"),
+            ([], {"trainer": 3}, "wrong_type", "trainer"),
+            ([], {"seed": "many"}, "wrong_type", "seed"),
+            (["seed=1"], {"seed": 2}, "conflicting_settings", "seed"),
+            (["trainer.max_steps=1"], {"trainer": {"max_steps": 2}}, "conflicting_settings", None),
+            (["resume=x"], {}, "conflicting_settings", "resume"),
+            ([], {"task": "param"}, "conflicting_settings", "task"),
+            (["surface=cow"], {}, "conflicting_settings", "surface"),
+            (["domain=square"], {}, "conflicting_settings", "domain"),
+            ("seed=1", {}, "wrong_type", "overrides"),
+        ],
     )
+    def test_mistakes(self, request_of, overrides, settings, kind, key):
+        with pytest.raises(NsmError) as error:
+            request_of(overrides, **settings)
+        assert error.value.kind == kind
+        assert key is None or error.value.key == key

@@ -20,7 +20,7 @@ QUICK = [
     "experiment=quick",
     "data.held_out=2048",
     "trainer.threads=1",
-    "logger.every=10",
+    "trainer.log_every=10",
 ]
 
 

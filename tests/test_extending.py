@@ -1,108 +1,196 @@
-"""What users register, and the page that shows how: its examples run as they stand."""
+"""What users write themselves, and the page that shows how: its examples run as they stand."""
 
 import re
+import sys
+import types
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
+from torch import nn
 
 import nsm
-from nsm.config import compose_config
-from nsm.energies import ENERGIES, energy
-from nsm.maps import ACTIVATIONS, ANALYTIC, BLOCKS, ENCODINGS, build_analytic, build_map
+from nsm import extensions
+from nsm.config import compose_config, composed
+from nsm.errors import NotTrusted, NsmError
+from nsm.instantiation import check_trusted, made
+from nsm.maps import ANALYTIC, BLOCKS
 
-PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
-EXAMPLES = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.S | re.M)
+PAGE = (Path(__file__).parent.parent / "docs" / "extending.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"^```python\n(.*?)^```$", PAGE, re.S | re.M)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tables():
+    """What is registered here is forgotten afterwards."""
+    before = [dict(table) for table in (ANALYTIC, BLOCKS)]
+    repo = {group: dict(options) for group, options in ConfigStore.instance().repo.items()
+            if isinstance(options, dict)}  # fmt: skip
+    yield
+    for table, old in zip((ANALYTIC, BLOCKS), before, strict=True):
+        table.clear()
+        table.update(old)
+    for group in ("activation", "encoding", "energy"):
+        ConfigStore.instance().repo[group] = repo.get(group, {})
+    extensions._KINDS.clear()
 
 
 @pytest.fixture(scope="module")
 def page():
     """The names that the page's examples leave, run in turn as a reader would."""
-    tables = (ENERGIES, ACTIVATIONS, ENCODINGS, BLOCKS, ANALYTIC)
-    before = [dict(table) for table in tables]
-    names: dict = {"__name__": "page"}
+    module = types.ModuleType("mine")
+    sys.modules["mine"] = module
     for block in EXAMPLES:
-        assert len([line for line in block.splitlines() if line.strip()]) < 15
-        if "nsm.cli" not in block:
-            exec(block, names)
-    yield names
-    for table, old in zip(tables, before, strict=True):
-        table.clear()
-        table.update(old)
+        exec(block, module.__dict__)
+    yield module.__dict__
+    del sys.modules["mine"]
 
 
-def metrics(count):
-    jacobian = torch.randn(2, count, 3, 2, dtype=torch.float64)
-    return jacobian.transpose(-1, -2) @ jacobian
+@pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_an_example_is_short(example):
+    assert len([line for line in example.splitlines() if line.strip()]) < 22
 
 
-def test_energy_is_what_its_formula_says(page):
-    source, target = metrics(50)
+RESULTS = {
+    "above": "loss_terms.floor",
+    "swished": "activation",
+    "waved": "encoding",
+    "small": "map",
+    "upper": "sampler",
+    "noisy": "data",
+    "there": "domain",
+    "robust": "task",
+    "nadam": "optimizer",
+}
+
+
+@pytest.mark.parametrize(("name", "group"), RESULTS.items())
+def test_the_class_is_what_the_run_used(page, name, group):
+    node = page[name].config
+    for key in group.split("."):
+        node = node[key]
+    assert node["_target_"].startswith(("mine.", "torch.optim"))
+    assert all(value == value for value in page[name].metrics.values())
+
+
+def test_the_energy_is_what_its_formula_says(page):
+    jacobian = torch.randn(2, 50, 3, 2, dtype=torch.float64)
+    source, target = jacobian.transpose(-1, -2) @ jacobian
     squared = torch.linalg.eigvals(torch.linalg.solve(source, target)).real
     expected = ((squared.log() / 2) ** 2).sum(dim=-1)
-    assert torch.allclose(energy("hencky")(source, target), expected, rtol=1e-4)
-    assert page["flat"].config["energy"]["weights"] == {"hencky": 1.0}
+    assert torch.allclose(page["Hencky"]()(source, target), expected, rtol=1e-4)
     assert page["flat"].metrics["nsm"]["flipped_percent"] == 0
 
 
-@pytest.mark.parametrize(
-    "part",
-    [
-        {"activation": {"name": "swish", "beta": 2.0}},
-        {"encoding": {"name": "waves", "octaves": 3}},
-        {"block": "highway", "encoding": {"name": "spline_grid", "resolutions": [4]}},
-    ],
-    ids=["activation", "encoding", "block"],
-)
-def test_jacobians_and_their_gradients(page, part):
-    net = build_map({"width": 3, "depth": 1, "block": "pre", **part}).double()
-    x = torch.rand(2, 2, dtype=torch.float64, requires_grad=True)
+@pytest.mark.parametrize("name", ["swished", "waved", "gated", "small"])
+def test_jacobians_of_foreign_parts(page, name):
+    net = page[name].map.double()
+    x = torch.rand(2, 2, dtype=torch.float64)
     expected = torch.func.vmap(torch.func.jacfwd(lambda p: net(p[None])[0]))(x)
     assert torch.allclose(net.value_and_jacobian(x)[1], expected)
-    assert torch.autograd.gradcheck(lambda x, *_: net.value_and_jacobian(x), (x, *net.parameters()))
+    net.float()
 
 
-def test_an_encoding_of_ones_own_starts_at_random(page):
-    assert compose_config(["encoding=waves"]).map.linear_skip == "none"
-    assert compose_config(["encoding=waves", "initialization=fitted"]).map.linear_skip == "fitted"
-
-
-def test_analytic_jacobian(page):
-    dune = build_analytic({"name": "dune", "height": 0.4})
-    x = torch.rand(6, 2, dtype=torch.float64)
-    expected = torch.func.vmap(torch.func.jacfwd(lambda p: dune(p[None])[0]))(x)
-    assert torch.allclose(dune.value_and_jacobian(x)[1], expected)
-    with pytest.raises(nsm.NsmError, match="dune: .*'width'"):
-        build_analytic({"name": "dune", "width": 1})
-
-
-def test_a_saved_network_of_ones_own_needs_its_registration(page, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["swished", "waved", "small"])
+def test_a_saved_network_needs_trust(page, name, tmp_path):
     uv = torch.rand(5, 2)
-    for name, table, register in (
-        ("swished", "ACTIVATIONS", "register_activation"),
-        ("waved", "ENCODINGS", "register_encoding"),
-        ("gated", "BLOCKS", "register_block"),
-    ):
-        page[name].save(tmp_path)
-        assert torch.equal(nsm.load(tmp_path)(uv), page[name](uv))
-        with monkeypatch.context() as patch:
-            builtin = {"softplus": None, "spline_grid": None, "plain": None}
-            patch.setattr(f"nsm.results.networks.{table}", builtin)
-            with pytest.raises(nsm.NsmError, match=f"call nsm.{register} first"):
-                nsm.load(tmp_path)
+    page[name].save(tmp_path)
+    with pytest.raises(NotTrusted) as error:
+        nsm.load(tmp_path)
+    assert error.value.key == "mine"
+    for trust in ("mine", ["mine"]):
+        assert torch.equal(nsm.load(tmp_path, trust=trust)(uv), page[name](uv))
 
 
-def test_names_that_cannot_be_taken():
-    with pytest.raises(nsm.NsmError, match="'arap' is there already"):
-        nsm.register_energy("arap", lambda m: m.trace)
-    with pytest.raises(nsm.NsmError, match="lower case"):
-        nsm.register_energy("../mine", lambda m: m.trace)
-    with pytest.raises(nsm.NsmError, match="one finite number"):
-        nsm.register_energy("mean", lambda m: m.trace.mean())
-    with pytest.raises(nsm.NsmError, match="c needs a number"):
-        nsm.register_activation("mine", lambda z, c: z)
+def test_a_saved_network_with_a_registered_name(page, tmp_path, monkeypatch):
+    uv = torch.rand(5, 2)
+    page["named"].save(tmp_path)
+    assert torch.equal(nsm.load(tmp_path)(uv), page["named"](uv))
+    with monkeypatch.context() as patch:
+        patch.delattr(extensions.registered, "softsine")
+        with pytest.raises(NsmError):
+            nsm.load(tmp_path)
 
 
-def test_settings_of_ones_own_are_checked(page):
-    with pytest.raises(nsm.NsmError, match="did you mean 'beta'"):
-        compose_config(["activation=swish", "+activation.bta=2"])
+def test_the_commands_of_the_page_compose(page):
+    commands = re.findall(r"`(?:nsm )?(\+?[\w.]+=[^`]*)`", PAGE)
+    checked = 0
+    for command in (" ".join(c.split()) for c in commands):
+        if "FOLDER" in command or '"' in command or command.startswith(("area", "initialization")):
+            continue
+        task = "task=param " if command.startswith("energy") else ""
+        if "=" in command and not re.search(r"\b\w+=[A-Z]\w*$", command):
+            compose_config((task + command).split())
+            checked += 1
+    assert checked >= 6
+
+
+@pytest.mark.parametrize(
+    ("name", "activation"),
+    [
+        ("s", torch.sin),
+        ("m", nn.Mish()),
+        ("c", nn.CELU),
+        ("l", lambda z, beta=1.5: z * torch.sigmoid(beta * z)),
+    ],
+)
+def test_any_activation_can_be_registered(name, activation):
+    nsm.register_activation(name, activation)
+    config = compose_config([f"activation={name}"])
+    check_trusted(dict(config.activation))
+    module = made(config.activation)
+    z = torch.linspace(-1, 1, 5)
+    expected = activation()(z) if isinstance(activation, type) else activation(z)
+    assert torch.equal(module(z), expected)
+    assert made(config.activation) is not module
+    if name == "l":
+        assert compose_config(["activation=l", "activation.beta=2"]).activation.beta == 2
+        with pytest.raises(NsmError) as error:
+            compose_config(["activation=l", "activation.bta=2"])
+        assert error.value.kind == "unknown_setting"
+
+
+def test_registering_again_replaces():
+    nsm.register_activation("again", lambda z: z)
+    nsm.register_activation("again", lambda z: 2 * z)
+    assert made(compose_config(["activation=again"]).activation)(torch.ones(1)) == 2
+
+
+def test_a_registered_encoding_starts_at_random():
+    class Waves(nn.Module):
+        def __init__(self, octaves: int = 3):
+            super().__init__()
+            self.out_dim = 2
+
+        def forward(self, x):
+            return x
+
+    nsm.register_encoding("waves", Waves)
+    assert composed(["encoding=waves"])[0].map.get("linear_skip", "none") == "none"
+    config = compose_config(["encoding=waves", "encoding.octaves=6"])
+    assert config.encoding.octaves == 6
+
+
+def test_a_registered_energy():
+    nsm.register_energy("stretch", lambda m: m.trace)
+    energy = made(compose_config(["task=param", "energy=stretch"]).energy)
+    same = torch.eye(2).expand(3, 2, 2)
+    assert torch.allclose(energy(same, same).double(), torch.full((3,), 2.0).double())
+
+
+@pytest.mark.parametrize(
+    ("register", "name", "thing", "kind"),
+    [
+        ("energy", "arap", lambda m: m.trace, "name_taken"),
+        ("block", "pre", nn.Linear, "name_taken"),
+        ("analytic", "plane", lambda u, v: (u, v, u), "name_taken"),
+        ("energy", "../mine", lambda m: m.trace, "invalid_name"),
+        ("energy", "mean", lambda m: m.trace.mean(), "wrong_shape"),
+        ("activation", "mine", lambda z, c: z, "missing_default"),
+    ],
+)
+def test_what_cannot_be_registered(register, name, thing, kind):
+    with pytest.raises(NsmError) as error:
+        getattr(nsm, f"register_{register}")(name, thing)
+    assert (error.value.kind, error.value.key) == (kind, name)

@@ -1,8 +1,8 @@
 """Launchers: where the jobs of a sweep run.
 
-All of them check the settings of every job before the first starts, skip what is complete, keep
-each job's failure to itself, and say in the end what became of them. A job is handed over as plain
-settings and a folder, so that the place where it runs needs nothing of Hydra.
+All of them check the settings of every job before the first starts, skip complete jobs, and go on
+with the others when one fails. A job is plain settings and a folder, so that the process that runs
+it needs nothing of Hydra.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from nsm.errors import NsmError
 from nsm.optional_dependencies import needed
 from nsm.sweeps import OUTCOMES, Job, Outcome, is_complete, job_folder, swept_keys
 
-_KILLED = "its process was killed, perhaps for want of memory"
+_KILLED = "its process was killed, perhaps because memory ran out"
 _POLL = 0.5  # seconds
 
 
@@ -53,12 +53,12 @@ class SweepLauncher(Launcher):
             if is_complete(job.folder)
         }
         for outcome in outcomes.values():
-            self._say(f"complete before: {_words(outcome)}")
+            self._say(f"complete before: {_label(outcome)}")
         waiting = {job.folder: job for job in jobs if job.folder not in outcomes}
         for number, (job, error) in enumerate(self.run(list(waiting.values())), start=1):
             outcome = Outcome(job.words, job.folder, error)
             outcomes[job.folder] = outcome
-            became = f"failed: {_words(outcome)}: {error}" if error else f"done: {_words(outcome)}"
+            became = f"failed: {_label(outcome)}: {error}" if error else f"done: {_label(outcome)}"
             self._say(f"[{number}/{len(waiting)}] {became}")
         OUTCOMES.extend(outcomes.values())
         return [_returned(outcomes[job.folder]) for job in jobs]
@@ -77,9 +77,11 @@ class SweepLauncher(Launcher):
         with open_dict(config):
             del config["hydra"]
         try:
-            settings: Any = OmegaConf.to_container(checked(config))
+            settings: Any = OmegaConf.to_container(checked(config, overrides))
         except NsmError as error:
-            raise NsmError(f"{' '.join(words) or 'the job'}: {error}") from error
+            raise NsmError(
+                f"{' '.join(words) or 'the job'}: {error}", kind=error.kind, key=error.key
+            ) from error
         return Job(settings, job_folder(Path(hydra.sweep.dir), settings, words), words)
 
     def _say(self, line: str) -> None:
@@ -97,9 +99,8 @@ class Serial(SweepLauncher):
             yield job, run_job(*job.call, log=False)
 
 
-class Together(SweepLauncher):
-    """Jobs of task=overfit with networks and settings that are alike in one batch in this process,
-    the others one after the other.
+class Batched(SweepLauncher):
+    """Jobs of task=overfit with equal networks and settings in one batch, the others in turn.
 
     Args:
         at_once: jobs in a batch, at most.
@@ -113,7 +114,11 @@ class Together(SweepLauncher):
         from nsm.pipeline.sweep_jobs import run_job
 
         if self.at_once < 1:
-            raise NsmError("setting hydra.launcher.at_once: it is at least 1")
+            raise NsmError(
+                "setting hydra.launcher.at_once: it must be at least 1",
+                kind="out_of_range",
+                key="hydra.launcher.at_once",
+            )
         for numbers in batches([job.settings for job in jobs], self.at_once):
             batch = [jobs[number] for number in numbers]
             names = [" ".join(job.words) or job.folder.name for job in batch]
@@ -147,8 +152,8 @@ class Joblib(SweepLauncher):
             return
         except BrokenProcessPool:
             pass
-        # A killed process takes the pool with it. The rest goes on singly, so that it is seen
-        # which job it is; with two places for one job joblib still makes a process for it.
+        # A killed process takes the pool with it. The rest runs singly, which shows the job that
+        # kills; with two places for one job joblib still makes a process for it.
         for job in left:
             try:
                 yield job, next(iter(self._pool(joblib, 2, [job])))[1]
@@ -163,23 +168,37 @@ class Joblib(SweepLauncher):
             pre_dispatch="all",
             batch_size=1,
         )
-        return pool(joblib.delayed(_told)(job.folder, *job.call) for job in jobs)
+        return pool(joblib.delayed(run_in_process)(job.folder, *job.call) for job in jobs)
 
 
 class Submitit(SweepLauncher):
-    """Jobs of a SLURM cluster, or processes of this machine that stand for them.
+    """Jobs of a SLURM cluster, or local processes for a trial.
 
     Args:
         cluster: ``slurm`` or ``local``.
         parallel: jobs at a time; None for no limit.
-        timeout_min, cpus_per_task, gpus_per_node, mem_gb: of a job.
+        timeout_min: minutes that a job may take; one that is cut off is queued again.
+        cpus_per_task, gpus_per_node, mem_gb: of each job.
         parameters: further ones of ``submitit.AutoExecutor.update_parameters``.
     """
 
     def __init__(
-        self, cluster: str, parallel: int | None, parameters: dict[str, Any], **shared: Any
+        self,
+        cluster: str,
+        parallel: int | None,
+        timeout_min: int,
+        cpus_per_task: int,
+        gpus_per_node: int,
+        mem_gb: float,
+        parameters: dict[str, Any],
     ) -> None:
         self.cluster, self.parallel = cluster, parallel
+        shared = {
+            "timeout_min": timeout_min,
+            "cpus_per_task": cpus_per_task,
+            "gpus_per_node": gpus_per_node,
+            "mem_gb": mem_gb,
+        }
         self.parameters = {**shared, **parameters}
 
     def run(self, jobs: list[Job]) -> Iterator[Finished]:
@@ -190,7 +209,9 @@ class Submitit(SweepLauncher):
             executor.update_parameters(**self.parameters)
         except (RuntimeError, ValueError, NameError) as error:
             reason = " ".join(str(error).split())
-            raise NsmError(f"hydra/launcher=submitit: {reason}") from error
+            raise NsmError(
+                f"hydra/launcher=submitit: {reason}", kind="launcher_failed", key="hydra/launcher"
+            ) from error
         waiting = list(jobs)
         running: dict[Any, Job] = {}
         while waiting or running:
@@ -212,7 +233,7 @@ class Submitit(SweepLauncher):
 
 
 class Resumable:
-    """A job as submitit runs it; one that is cut off by time goes on where it was."""
+    """A job as submitit runs it; one that runs out of time continues from its checkpoint."""
 
     def __call__(self, settings: dict[str, Any], folder: str, cwd: str) -> str | None:
         from nsm.pipeline.sweep_jobs import run_job
@@ -228,8 +249,8 @@ class Ray(SweepLauncher):
     """Jobs on a Ray cluster.
 
     Args:
-        address: of the cluster; None for a Ray that is started here and ends with the sweep.
-        cpus_per_job, gpus_per_job: what a job takes up.
+        address: of the cluster, or auto; None starts a local Ray for the sweep.
+        cpus_per_job, gpus_per_job: of each job.
         init: further parameters of ``ray.init``.
     """
 
@@ -246,10 +267,13 @@ class Ray(SweepLauncher):
         try:
             ray.init(**{**_RAY, "address": self.address, **self.init})
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise NsmError(f"hydra/launcher=ray: {' '.join(str(error).split())}") from error
+            reason = " ".join(str(error).split())
+            raise NsmError(
+                f"hydra/launcher=ray: {reason}", kind="launcher_failed", key="hydra/launcher"
+            ) from error
         try:
             # a process for each job, which leaves nothing behind for the next
-            remote = ray.remote(max_calls=1, max_retries=0, **self.share)(_told)
+            remote = ray.remote(max_calls=1, max_retries=0, **self.share)(run_in_process)
             running = {remote.remote(job.folder, *job.call): job for job in jobs}
             while running:
                 ended, _ = ray.wait(list(running))
@@ -266,14 +290,16 @@ class Ray(SweepLauncher):
 _RAY = {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"}
 
 
-def _told(place: Path, settings: dict[str, Any], folder: str, cwd: str) -> tuple[Path, str | None]:
-    """Run a job in a process of its own, and say which it was."""
+def run_in_process(
+    place: Path, settings: dict[str, Any], folder: str, cwd: str
+) -> tuple[Path, str | None]:
+    """Run a job in its own process; give its first argument back with why it failed, or None."""
     from nsm.pipeline.sweep_jobs import run_job
 
     return place, run_job(settings, folder, cwd, log=True)
 
 
-def _words(outcome: Outcome) -> str:
+def _label(outcome: Outcome) -> str:
     return " ".join(outcome.words) or outcome.folder.name
 
 

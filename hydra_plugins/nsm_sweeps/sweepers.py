@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
@@ -31,38 +31,74 @@ _DIRECTIONS = ("minimize", "maximize")
 _STUDY_FILE, _BEST_FILE = "optuna.journal", "best.json"
 
 
-class Grid(BasicSweeper):
-    """All combinations; a sweep that is refused leaves no folder."""
-
-    def sweep(self, arguments: list[str]) -> Any:
-        try:
-            return super().sweep(arguments)
-        except Exception:
-            folder = Path(self.config.hydra.sweep.dir)  # type: ignore[union-attr]
-            if [file.name for file in folder.glob("*")] == ["multirun.yaml"]:
-                (folder / "multirun.yaml").unlink()
-                folder.rmdir()
-            raise
-
-
-class Optuna(Sweeper):
-    """Trials that Optuna chooses by the figures of those before.
-
-    The study is kept in the sweep's folder: run again, the sweep goes on until it has so many
-    complete trials, those that failed or were interrupted first.
-
-    Args:
-        n_trials: complete trials in all.
-        n_jobs: trials at a time.
-        objective: the figure, as a dotted key of metrics.json.
-        direction: ``minimize`` or ``maximize``.
-        sampler: ``tpe``, ``gp``, ``qmc`` or ``random``.
-        seed: of the sampler.
-        params: what is swept, beside the words of the command.
-    """
+class _JobSweeper(Sweeper):
+    """Base of the sweepers: takes the configuration and makes the launcher."""
 
     config: DictConfig
     launcher: Launcher
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        self.config, self.loader = config, hydra_context.config_loader
+        self.launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+
+class Grid(_JobSweeper):
+    """All combinations of the values of a sweep.
+
+    Args:
+        max_batch_size: jobs that the launcher gets at once; None: all.
+        params: what is swept, besides the overrides of the command: {seed: "0,1,2"}.
+    """
+
+    def __init__(self, max_batch_size: int | None, params: dict[str, str] | None) -> None:
+        self.max_batch_size, self.params = max_batch_size, params
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Run the jobs.
+
+        Raises:
+            NsmError: an interval, which has no list of values, or settings that cannot be used.
+        """
+        values = []
+        for override in overrides_of(arguments, self.params, self.loader):
+            key = override.get_key_element()
+            if override.is_discrete_sweep():
+                values.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+            elif override.is_sweep_override():
+                raise NsmError(
+                    f"{override.input_line}: a grid needs values, {key}=A,B; an interval goes with "
+                    "hydra/sweeper=optuna",
+                    kind="wrong_type",
+                    key=key,
+                )
+            else:
+                values.append([str(override.input_line)])
+        jobs = [list(job) for job in itertools.product(*values)]
+        size = self.max_batch_size or len(jobs)
+        for first in range(0, len(jobs), size):
+            self.launcher.launch(jobs[first : first + size], initial_job_idx=first)
+
+
+class Optuna(_JobSweeper):
+    """Trials that Optuna chooses by the figures of earlier ones.
+
+    The sweep's folder keeps the study: run again, the sweep continues until it has ``n_trials``
+    complete trials, with those that failed or were interrupted first.
+
+    Args:
+        n_trials: complete trials in all, those of earlier runs included.
+        n_jobs: trials at a time.
+        objective: the figure that decides, as a dotted key of metrics.json.
+        direction: ``minimize`` or ``maximize``.
+        sampler: ``tpe``, ``gp``, ``qmc`` or ``random``.
+        seed: of the sampler.
+        params: what is swept, besides the overrides of the command:
+            {optimizer.lr: "interval(1e-4, 1e-1)"}.
+    """
 
     def __init__(
         self,
@@ -78,16 +114,8 @@ class Optuna(Sweeper):
         self.direction, self.sampler, self.seed = direction, sampler, seed
         self.params = params
 
-    def setup(
-        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
-    ) -> None:
-        self.config = config
-        self.launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=hydra_context, task_function=task_function, config=config
-        )
-
     def sweep(self, arguments: list[str]) -> None:
-        """Run the trials, and leave the best one's words, figure and folder in best.json.
+        """Run the trials, and leave the best one's overrides, figure and folder in best.json.
 
         Raises:
             NsmError: nothing is swept, or the objective is not a figure of the task.
@@ -95,7 +123,7 @@ class Optuna(Sweeper):
         self._check()
         optuna = needed("optuna", "hydra/sweeper=optuna")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        overrides = overrides_of(arguments, self.params)
+        overrides = overrides_of(arguments, self.params, self.loader)
         space = {
             o.get_key_element(): _distribution(optuna, o)
             for o in overrides
@@ -103,7 +131,9 @@ class Optuna(Sweeper):
         }
         if not space:
             raise NsmError(
-                "hydra/sweeper=optuna: nothing to choose; give optimizer.lr=interval(a,b)"
+                "hydra/sweeper=optuna: nothing to choose; give optimizer.lr=interval(a,b)",
+                kind="missing_setting",
+                key="hydra/sweeper",
             )
         fixed = [
             f"{o.get_key_element()}={o.get_value_element_as_str()}"
@@ -116,7 +146,7 @@ class Optuna(Sweeper):
         first = len(study.trials)
         while to_go > 0:
             trials = [study.ask(space) for _ in range(min(self.n_jobs, to_go))]
-            chosen = [[*fixed, *_words(trial.params)] for trial in trials]
+            chosen = [[*fixed, *_overrides(trial.params)] for trial in trials]
             returns = self.launcher.launch(chosen, initial_job_idx=first)
             for trial, returned in zip(trials, returns, strict=True):
                 self._tell(optuna, study, trial, returned.return_value)
@@ -124,13 +154,18 @@ class Optuna(Sweeper):
         self._close(optuna, study, folder)
 
     def _check(self) -> None:
-        words = {"sampler": (self.sampler, _SAMPLERS), "direction": (self.direction, _DIRECTIONS)}
-        for key, (given, known) in words.items():
-            if given not in known:
-                near = difflib.get_close_matches(given, known, n=1, cutoff=0.0)[0]
-                raise NsmError(f"setting hydra.sweeper.{key}: {given!r}; did you mean {near!r}?")
-        if self.n_trials < 1 or self.n_jobs < 1:
-            raise NsmError("settings hydra.sweeper.n_trials and n_jobs: they are at least 1")
+        known = {"sampler": (self.sampler, _SAMPLERS), "direction": (self.direction, _DIRECTIONS)}
+        for name, (given, names) in known.items():
+            if given not in names:
+                key = f"hydra.sweeper.{name}"
+                near = difflib.get_close_matches(given, names, n=1, cutoff=0.0)[0]
+                message = f"setting {key}: {given!r}; did you mean {near!r}?"
+                raise NsmError(message, kind="unknown_option", key=key)
+        for name, count in (("n_trials", self.n_trials), ("n_jobs", self.n_jobs)):
+            if count < 1:
+                key = f"hydra.sweeper.{name}"
+                message = f"setting {key}: it must be at least 1"
+                raise NsmError(message, kind="out_of_range", key=key)
 
     def _study(self, optuna: Any, folder: Path) -> Any:
         folder.mkdir(parents=True, exist_ok=True)
@@ -142,7 +177,7 @@ class Optuna(Sweeper):
             direction=self.direction,
             load_if_exists=True,
         )
-        # not the numbers again that the trials before had
+        # other random numbers than those of the earlier trials
         sampler = getattr(optuna.samplers, _SAMPLERS[self.sampler])
         study.sampler = sampler(seed=self.seed + len(study.trials))
         states = optuna.trial.TrialState
@@ -169,17 +204,17 @@ class Optuna(Sweeper):
         if not complete:
             return
         best = study.best_trial
-        words = {
+        summary = {
             "objective": self.objective,
             "value": best.value,
-            "overrides": _words(best.params),
+            "overrides": _overrides(best.params),
             "folder": best.user_attrs["folder"],
             "trials": len(complete),
         }
-        (folder / _BEST_FILE).write_text(json.dumps(words, indent=2) + "\n", encoding="utf-8")
+        (folder / _BEST_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         print(
             f"best of {len(complete)}: {self.objective} {best.value:.6g} with "
-            f"{' '.join(_words(best.params))}",
+            f"{' '.join(_overrides(best.params))}",
             flush=True,
         )
 
@@ -188,7 +223,7 @@ def _complete(optuna: Any, study: Any) -> list[Any]:
     return list(study.get_trials(states=(optuna.trial.TrialState.COMPLETE,)))
 
 
-def _words(params: dict[str, Any]) -> list[str]:
+def _overrides(params: dict[str, Any]) -> list[str]:
     return [f"{key}={value}" for key, value in params.items()]
 
 
@@ -214,7 +249,9 @@ def _figure(folder: Path, key: str) -> float | None:
         near = difflib.get_close_matches(key, figures, n=1, cutoff=0.0)
         raise NsmError(
             f"setting hydra.sweeper.objective: {key} is no figure of {folder}/metrics.json; "
-            f"did you mean {near[0]!r}?"
+            f"did you mean {near[0]!r}?",
+            kind="unknown_option",
+            key="hydra.sweeper.objective",
         )
     return figures[key]
 

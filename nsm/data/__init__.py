@@ -1,7 +1,16 @@
-"""Lightning data modules over prepared surfaces; sampling stays on the device."""
+"""Lightning data modules over prepared surfaces; samples are drawn on the training's device."""
 
 from nsm.data.collection import CollectionData
-from nsm.data.overfit import EnsembleData, OverfitData
+from nsm.data.sampler import Draws, Sampler
 from nsm.data.sampling import Samples, SurfaceSampler
+from nsm.data.surface import EnsembleData, SurfaceData
 
-__all__ = ["CollectionData", "OverfitData", "Samples", "EnsembleData", "SurfaceSampler"]
+__all__ = [
+    "CollectionData",
+    "Draws",
+    "EnsembleData",
+    "Sampler",
+    "Samples",
+    "SurfaceData",
+    "SurfaceSampler",
+]

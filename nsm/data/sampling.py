@@ -124,31 +124,11 @@ class SurfaceSampler:
         """``count`` points, uniform in Ω."""
         return self._at(*self._places(count, generator, self.cumulative_domain_area))
 
-    def draw(
-        self,
-        count: int,
-        vertex_share: float,
-        generator: torch.Generator,
-        domain_share: float = 0.0,
-    ) -> Samples:
-        """``count`` points: a share of random vertices, a share uniform in Ω, the rest by area."""
-        at_vertices = round(count * vertex_share)
-        in_domain = min(round(count * domain_share), count - at_vertices)
-        samples = self.by_area(count - at_vertices - in_domain, generator)
-        if in_domain:
-            samples = _join(samples, self.in_domain(in_domain, generator))
-        if at_vertices == 0:
-            return samples
-        index = torch.randint(
-            len(self.vertices), (at_vertices,), generator=generator, device=self.device
-        )
-        return _join(samples, self.at_vertices(index))
-
     def pool(self, count: int, generator: torch.Generator) -> Samples:
         """A fixed set: all vertices and, by area, what is missing to ``count``."""
         everywhere = torch.arange(len(self.vertices), device=self.device)
         rest = self.by_area(max(count - len(everywhere), 0), generator)
-        return _join(rest, self.at_vertices(everywhere))
+        return join(rest, self.at_vertices(everywhere))
 
 
 def _cumulative(areas: Tensor) -> Tensor:
@@ -158,5 +138,6 @@ def _cumulative(areas: Tensor) -> Tensor:
     return cumulative / cumulative[-1]
 
 
-def _join(a: Samples, b: Samples) -> Samples:
+def join(a: Samples, b: Samples) -> Samples:
+    """The points of both."""
     return Samples(*(torch.cat(pair) for pair in zip(a, b, strict=True)))

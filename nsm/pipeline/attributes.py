@@ -15,7 +15,7 @@ from nsm.results.points import as_values
 
 
 def read_attributes(settings: dict[str, Any], rows: Sequence[int]) -> dict[str, np.ndarray]:
-    """The arrays of ``attributes.source`` and ``attributes.target``, by these words.
+    """The arrays of ``attributes.source`` and ``attributes.target``, under these keys.
 
     Each is a .npy file with a row for each vertex of its mesh file.
 
@@ -24,16 +24,16 @@ def read_attributes(settings: dict[str, Any], rows: Sequence[int]) -> dict[str, 
         rows: how many vertices the two mesh files have.
 
     Raises:
-        NsmError: a file that is no such array.
+        NsmError: a file that is not such an array.
     """
     result = {}
     for key, count in zip(("source", "target"), rows, strict=True):
         if settings[key] is None:
             continue
         try:
-            if not Path(settings[key]).is_file():  # a pipe would be waited for
+            if not Path(settings[key]).is_file():  # reading a pipe would block
                 raise ValueError("no such file")
-            # mapped, so that a header that lies about the size makes no room for it
+            # memory-mapped: a header with a false size allocates nothing
             values = np.load(settings[key], mmap_mode="r", allow_pickle=False)
             if not isinstance(values, np.ndarray):
                 raise ValueError("an archive of arrays")
@@ -45,7 +45,9 @@ def read_attributes(settings: dict[str, Any], rows: Sequence[int]) -> dict[str, 
             reason = " ".join(str(error).split())[:160]
             raise NsmError(
                 f"attributes.{key}={settings[key]}: {reason}; give a .npy array with a row for "
-                "each vertex"
+                "each vertex",
+                kind="unreadable_file",
+                key=f"attributes.{key}",
             ) from error
         result[key] = values
     return result

@@ -1,37 +1,141 @@
-"""Jobs of a sweep that are trained in one batch, each with its own folder as if it were alone."""
+"""Overfits that are trained in one batch, each with its own folder as if it were alone."""
 
 from __future__ import annotations
 
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytorch_lightning as pl
 from rich.console import Console
 
-from nsm.config import register_resolvers
+from nsm.data import EnsembleData, SurfaceData
 from nsm.domains import Surface
 from nsm.errors import NsmError
-from nsm.pipeline.common import (
-    Run,
-    configured_surface,
-    report_surface,
-    settle_path,
-    stored_config,
-)
+from nsm.instantiation import made, target_of
+from nsm.maps.networks import SKIPS
+from nsm.pipeline.configured_surface import configured_surface, report_surface
 from nsm.pipeline.folder_lock import folder_lock
-from nsm.pipeline.overfit import common_settings, leave_results, overfit_ensemble
-from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_config, run_job
+from nsm.pipeline.overfit import OverfitTask
+from nsm.pipeline.runner import built, finish, make_task
+from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_run, run_job
+from nsm.pipeline.training import Run, plain, trained
+from nsm.plugins import import_here
+from nsm.results.callbacks import Pictures
+from nsm.results.loggers import WandB
 from nsm.sweeps import is_complete
+from nsm.tasks import Overfit, OverfitEnsemble
 from nsm.tasks.ensemble import EnsembleSplit
+from nsm.tasks.joint_optimizer import shared_options
 
 Call = tuple[dict[str, Any], str, str]  # settings, folder and cwd, as for run_job
 Ended = tuple[int, "str | None"]  # number of a job, and why it failed
+
+
+def common_settings(settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What the settings of trainings must have in common to be made in one batch.
+
+    Surface, seed, loss weights and the optimizer's rates may differ.
+
+    Args:
+        settings: the whole configuration, as plain dictionaries and lists.
+
+    Returns:
+        None if the training has to be made alone.
+    """
+    trainer, optimizer = settings["trainer"], shared_options(settings["optimizer"])
+    loggers = [logger["_target_"] for logger in settings["logger"].values()]
+    if (
+        settings["task"]["_target_"] != target_of(OverfitTask)
+        or settings["data"]["_target_"] not in (target_of(SurfaceData), "nsm.data.SurfaceData")
+        or settings["map"]["block"] not in SKIPS
+        or settings["loss_terms"]
+        or settings["callbacks"]
+        or optimizer is None
+        or trainer["devices"] > 1
+        # these act on the gradients of all
+        or (trainer["stop_gradient_norm"], trainer["gradient_clip"]) != (None, None)
+        # one run at a time
+        or any(
+            logger in (target_of(WandB), "pytorch_lightning.loggers.WandbLogger")
+            for logger in loggers
+        )
+    ):
+        return None
+    own = ("surface", "domain", "seed", "artefacts", "resume", "loss_weights")
+    rest = {key: value for key, value in settings.items() if key not in own}
+    return {**rest, "optimizer": optimizer}
+
+
+@dataclass(frozen=True)
+class Member:
+    """A run of task=overfit in a batch, with its prepared surface."""
+
+    run: Run
+    task: OverfitTask
+
+
+def member(run: Run, surface: Surface, console: Console) -> Member:
+    """A member of a batch."""
+    task = make_task(run.config, console)
+    assert isinstance(task, OverfitTask)
+    task.use(surface)
+    return Member(run, task)
+
+
+def overfit_ensemble(
+    members: Sequence[Member], console: Console
+) -> tuple[list[Overfit], pl.Trainer]:
+    """Train several networks in one batch, each in its run folder, as each would be alone.
+
+    Args:
+        members: with :func:`common_settings`, and checkpoints of one step if they go on.
+        console: where to print.
+
+    Returns:
+        The trained modules, and the trainer, for :func:`nsm.pipeline.runner.finish`.
+
+    Raises:
+        NsmError: settings that do not fit together.
+        EnsembleSplit: some have to be trained alone; all have whole checkpoints, if any.
+    """
+    modules: list[Overfit] = []
+    starts: dict[tuple[int, int], Overfit] = {}
+    for one in members:
+        key = id(one.task.surface), one.run.config.seed
+        one.task.start = starts.get(key)
+        modules.append(built(one.task))
+        starts.setdefault(key, modules[-1])
+    task_of = {module: one.task for module, one in zip(modules, members, strict=True)}
+
+    def picture(module: Any) -> np.ndarray:
+        return task_of[module].picture(module)
+
+    config = members[0].run.config
+    settings = plain(config)["data"]
+    settings.pop("_target_")
+    data = EnsembleData(
+        [one.task.surface for one in members],
+        made(config.sampler),
+        [one.run.config.seed for one in members],
+        **settings,
+    )
+    trainer = trained(
+        [one.run for one in members],
+        data,
+        OverfitEnsemble(modules),
+        console,
+        Pictures(OverfitTask.picture_name, picture, config.trainer.log_pictures),
+        f"overfit {len(members)} networks",
+    )
+    return modules, trainer
 
 
 def batches(settings: Sequence[dict[str, Any]], at_once: int) -> list[list[int]]:
@@ -44,14 +148,14 @@ def batches(settings: Sequence[dict[str, Any]], at_once: int) -> list[list[int]]
     Returns:
         The numbers of the jobs of each batch; one that has to run alone is a batch of one.
     """
-    alike: dict[str, list[int]] = {}
+    groups: dict[str, list[int]] = {}
     for number, one in enumerate(settings):
         common = common_settings(one)
         key = f"alone {number}" if common is None else json.dumps(common, sort_keys=True)
-        alike.setdefault(key, []).append(number)
+        groups.setdefault(key, []).append(number)
     return [
         numbers[start : start + at_once]
-        for numbers in alike.values()
+        for numbers in groups.values()
         for start in range(0, len(numbers), at_once)
     ]
 
@@ -63,8 +167,7 @@ class _Job:
     number: int
     call: Call
     lock: ExitStack
-    run: Run
-    surface: Surface
+    member: Member
 
     def alone(self) -> Ended:
         self.lock.close()
@@ -72,10 +175,10 @@ class _Job:
 
 
 def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
-    """Run jobs with :func:`nsm.pipeline.overfit.common_settings` in one batch.
+    """Run jobs with :func:`common_settings` in one batch.
 
-    Those that cannot be prepared fail alone. What is not at the same step as the others, or goes
-    wrong in the training, goes on alone from its own checkpoint.
+    Those that cannot be prepared fail alone. Jobs that are not at the same step as the others, or
+    fail in the training, go on alone from their own checkpoints.
 
     Args:
         calls: of each job, settings, folder and working folder, as for
@@ -86,7 +189,7 @@ def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
     """
     started = time.monotonic()
     os.chdir(calls[0][2])
-    register_resolvers()
+    import_here()
     console = Console(highlight=False, markup=False)
     surfaces: dict[str, Surface] = {}
     stages: dict[Any, list[_Job]] = {}
@@ -96,16 +199,15 @@ def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
             lock = locks.enter_context(ExitStack())
             try:
                 lock.enter_context(folder_lock(place))
-            except NsmError as told:  # another process is at work on it
-                yield number, str(told)
+            except NsmError as error:  # another process is at work on it
+                yield number, str(error)
                 continue
-            ready, error = attempted(place, partial(_ready, settings, place, surfaces, console))
+            ready, reason = attempted(place, partial(_ready, settings, place, surfaces, console))
             if ready is None:
                 lock.close()
-                yield number, error
+                yield number, reason
                 continue
-            job = _Job(number, call, lock, *ready)
-            stages.setdefault(job.run.stage, []).append(job)
+            stages.setdefault(ready.run.stage, []).append(_Job(number, call, lock, ready))
         for stage, jobs in stages.items():
             if stage is None:
                 yield from (job.alone() for job in jobs)
@@ -115,45 +217,42 @@ def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
 
 def _ready(
     settings: dict[str, Any], place: Path, surfaces: dict[str, Surface], console: Console
-) -> tuple[Run, Surface] | None:
-    """A job and its surface, of which each is prepared once; None if the job is complete."""
+) -> Member | None:
+    """A job with its surface, of which each is prepared once; None if the job is complete."""
     (place / ERROR_FILE).unlink(missing_ok=True)
     if is_complete(place):  # another sweep has been at it
         return None
-    config = job_config(settings, place)
-    resuming = config.resume is not None
-    if resuming:
-        config = stored_config(place)
-    settle_path(config)
-    key = f"{config.surface} {config.domain}"
+    run = job_run(settings, place)
+    key = f"{run.config.surface} {run.config.domain}"
     if key not in surfaces:
-        surfaces[key] = configured_surface(config)
+        surfaces[key] = configured_surface(run.config)
         report_surface(console, surfaces[key])
-    return Run(config, place, resuming), surfaces[key]
+    return member(run, surfaces[key], console)
 
 
 def _train(jobs: list[_Job], console: Console, started: float) -> Iterator[Ended]:
     while len(jobs) > 1:
         try:
-            modules, trainer = overfit_ensemble(
-                [job.run for job in jobs], [job.surface for job in jobs], console
-            )
+            modules, trainer = overfit_ensemble([job.member for job in jobs], console)
             break
         except Exception as fault:
-            # whatever it is, the job that it concerns will say it again
+            # whatever it is, the job that it concerns will report it again
             reason = " ".join(str(fault).split())[:200]
             which = fault.which if isinstance(fault, EnsembleSplit) else range(len(jobs))
             console.print(f"{reason}; {len(which)} of {len(jobs)} jobs go on alone")
             yield from (jobs[i].alone() for i in which)
-            left = [job for i, job in enumerate(jobs) if i not in which]
-            # they may have checkpoints by now
-            jobs = [replace(job, run=replace(job.run, resuming=True)) for job in left]
+            # the others may have checkpoints by now
+            jobs = [_resuming(job) for i, job in enumerate(jobs) if i not in which]
     else:
         yield from (job.alone() for job in jobs)
         return
     for index, (job, module) in enumerate(zip(jobs, modules, strict=True)):
-        run = job.run
-        given = run.config, run.folder, job.surface, module, trainer, console, started
-        error = attempted(run.folder, partial(leave_results, *given, index=index))[1]
+        task, run = job.member.task, job.member.run
+        work = partial(finish, task, run, module, trainer, started, index=index)
+        error = attempted(run.folder, work)[1]
         job.lock.close()
         yield job.number, error
+
+
+def _resuming(job: _Job) -> _Job:
+    return replace(job, member=replace(job.member, run=replace(job.member.run, resuming=True)))

@@ -1,84 +1,82 @@
-"""Certify maps: check the whole mesh, repair flips, and say plainly where that failed."""
+"""Certify maps: check the whole mesh, repair flips, and train on where that is not enough."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import pytorch_lightning as pl
-from omegaconf import DictConfig
-from rich.console import Console
 
+from nsm.config import PRECISIONS
+from nsm.errors import NsmError
+from nsm.pipeline.process_state import matmul_precision
+from nsm.pipeline.task import Task
+from nsm.pipeline.training import lightning_trainer
 from nsm.results.certificate import verdict
+from nsm.results.divergence_guard import DivergenceGuard
 
-_SHARE = 10  # a further round has this part of the training's steps
-
-
-class Certified(Protocol):
-    """A result that can tell whether it is injective, and mend itself."""
-
-    @property
-    def certificate(self) -> dict[str, Any]: ...
-
-    def repaired(self) -> Any: ...
+_SHARE = 10  # a further training has this part of the training's steps
+_OVERLAPS = "boundary_self_intersections"  # of a free boundary
 
 
-Result = TypeVar("Result", bound=Certified)
+def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[Any, dict[str, Any]]:
+    """The best result of a training, repaired until it is injective or all means are spent.
 
-
-def certified(
-    config: DictConfig,
-    trainer: pl.Trainer,
-    module: Any,
-    make: Callable[[], Result],
-    console: Console,
-) -> tuple[Result, dict[str, Any]]:
-    """The result of a training, repaired until it is injective or all means are spent.
-
-    What the network flips is turned back on the mesh; where that is not enough, the training goes
-    on with stronger terms for a bounded number of rounds, and the mesh is mended again.
+    Triangles that the network flips are turned back on the mesh; where that is not enough, the
+    training goes on with stronger terms for a bounded number of rounds, and the mesh is repaired
+    again. The result with the fewest faults is returned, the first of equal ones. A free boundary
+    that overlaps itself is reported: no term of the training acts on it.
 
     Args:
-        config: with ``certification.repair`` and ``certification.rounds``.
-        trainer: that of the training, with its data.
-        module: the task's module, which answers ``strengthen(steps)``.
-        make: the result from the module as it stands.
-        console: where the verdict goes.
+        task: with ``certification.repair`` and ``certification.rounds`` in its settings.
+        module: the trained module, which has ``strengthen(steps)``.
+        data: its samples.
 
     Returns:
-        The result; and what metrics.json says of it: its certificate, with the counts that the
-        network alone had (``before_repair``) and the rounds that it took.
+        The result; and its entries in metrics.json: its certificate, the counts of the network
+        alone (``before_repair``), and the number of further trainings (``rounds``).
     """
-    settings = config.certification
-    result = make()
+    settings, say = task.config.certification, task.console.print
+    best = result = task.make_result(module)
     before = result.certificate
     rounds = 0
-    while settings.repair and not result.certificate["certified"]:
+    while settings.repair and not best.certificate["certified"]:
         result = result.repaired()
-        if result.certificate["certified"] or rounds >= settings.rounds:
+        best = min(best, result, key=_faults)
+        if not _trainable(best) or rounds >= settings.rounds:
             break
         rounds += 1
-        console.print(f"{verdict(result.certificate)}; going on with stronger terms")
-        _go_on(trainer, module, max(1, config.trainer.max_steps // _SHARE))
-        result = make()
-    after = result.certificate
-    console.print(verdict(after) + ("" if before["certified"] else f"; before: {verdict(before)}"))
+        say(f"{verdict(best.certificate)}; going on with stronger terms")
+        try:
+            _train_on(task, module, data)
+        except NsmError as error:  # the loss stays infinite
+            say(f"{error}; the best result so far is kept", soft_wrap=True)
+            break
+        result = task.make_result(module)
+        best = min(best, result, key=_faults)
+    after = best.certificate
+    say(verdict(after) + ("" if before["certified"] else f"; before: {verdict(before)}"))
+    if after.get(_OVERLAPS):
+        say("the free boundary overlaps itself; constraints.boundary=fixed rules that out")
     counts = {name: n for name, n in before.items() if name != "certified"}
-    return result, {**after, "before_repair": counts, "rounds": rounds}
+    return best, {**after, "before_repair": counts, "rounds": rounds}
 
 
-def _go_on(trainer: pl.Trainer, module: Any, steps: int) -> None:
+def _faults(result: Any) -> int:
+    """How many faults the certificate counts."""
+    return sum(int(n) for name, n in result.certificate.items() if name != "certified")
+
+
+def _trainable(result: Any) -> bool:
+    """Whether the certificate counts faults that a further training acts on."""
+    skipped = ("certified", _OVERLAPS)
+    return any(n for name, n in result.certificate.items() if name not in skipped)
+
+
+def _train_on(task: Task, module: Any, data: pl.LightningDataModule) -> None:
+    config = task.config
+    steps = max(1, config.trainer.max_steps // _SHARE)
     module.strengthen(steps)
-    more = pl.Trainer(
-        accelerator=type(trainer.accelerator).name(),
-        devices=1,
-        max_steps=steps,
-        max_epochs=-1,
-        limit_val_batches=0,
-        gradient_clip_val=trainer.gradient_clip_val,
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-    )
-    more.fit(module, datamodule=trainer.datamodule)  # type: ignore[attr-defined]
+    guard = DivergenceGuard(task.console)
+    trainer = lightning_trainer(config, [guard], devices=1, max_steps=steps, limit_val_batches=0)
+    with matmul_precision(PRECISIONS[config.trainer.precision]):
+        trainer.fit(module, datamodule=data)

@@ -16,8 +16,9 @@ LOCK_FILE = ".lock"
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold a run folder, which is made if need be, and taken away if nothing came of it; the
-    operating system lets go of it when the process ends, however that happens.
+    """Lock a run folder, which is made if need be, and removed if nothing was written into it.
+
+    The operating system releases the lock when the process ends, however that happens.
 
     Raises:
         NsmError: another process holds it.
@@ -29,7 +30,9 @@ def folder_lock(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise NsmError(
-            f"{folder}: another run is at work there; wait for its end, or give another folder"
+            f"{folder}: another run is at work there; wait for its end, or give another folder",
+            kind="folder_in_use",
+            key=str(folder),
         ) from None
     try:
         yield

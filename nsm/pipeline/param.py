@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pytorch_lightning as pl
 import torch
-from omegaconf import DictConfig
-from rich.console import Console
 
+from nsm.data import SurfaceData
 from nsm.domains.baselines import BASELINES
-from nsm.pipeline.certification import certified
-from nsm.pipeline.common import built, frozen, plain, say_where, train, with_map, write_figures
 from nsm.pipeline.surface_cache import neural_surface
+from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     Parameterization,
@@ -25,108 +22,63 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
-from nsm.results.callbacks import Pictures
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 
 
-def run_param(
-    config: DictConfig,
-    folder: Path,
-    phi: NeuralSurface | None = None,
-    *,
-    resuming: bool = False,
-) -> Parameterization:
-    """Flatten a neural surface with least distortion, and compare with libigl's methods.
+class ParamTask(Task):
+    """A map of a neural surface to the plane, with least distortion, beside libigl's methods."""
 
-    Args:
-        config: as :func:`nsm.config.compose_config` gives it, with ``task=param``.
-        folder: the run folder.
-        phi: the neural surface, where it is at hand; else that of ``phi.path``, else one that is
-            made of the configured mesh, or taken from the cache if it was made before.
-        resuming: go on from the folder's checkpoint.
+    module, data, result, defaults = Param, SurfaceData, Parameterization, "param"
+    certified = True
+    table = staticmethod(comparison_table)
+    picture_name = "layout"
 
-    Raises:
-        NsmError: a mesh, neural surface, setting or run folder that cannot be used.
-    """
-    console = Console(highlight=False, markup=False)
-    started = time.monotonic()
-    if phi is None:
-        phi = neural_surface(config, console)
-    surface = phi.surface
-    module = build_param(config, phi)
+    def prepare(self, given: Given) -> None:
+        self.use(neural_surface(self.config, self.console) if given.phi is None else given.phi)
 
-    def picture(m: pl.LightningModule) -> np.ndarray:
-        uv = m(torch.as_tensor(surface.uv, dtype=torch.float32, device=m.device))
-        image = layout_image(surface, uv.detach().cpu().double().numpy())
+    def use(self, phi: NeuralSurface) -> None:
+        """Take the neural surface."""
+        self.phi, self.surface = phi, phi.surface
+
+    def build(self) -> Any:
+        surface = self.surface
+        areas = face_areas(surface.vertices, surface.faces)
+        mesh = (
+            torch.as_tensor(surface.uv, dtype=torch.float32),
+            torch.as_tensor(surface.faces),
+            torch.as_tensor(areas, dtype=torch.float32),
+        )
+        return self.module(**self.map_settings(), mesh=mesh, phi=self.phi.map)
+
+    def make_result(self, module: Any) -> Parameterization:
+        return Parameterization(self.phi, frozen(module.map), {}, self.settings)
+
+    def measure(self, result: Parameterization) -> None:
+        surface = self.surface
+        maps = {"domain": surface.uv, "nsm": result.uv}
+        for name, method in BASELINES.items():
+            try:
+                maps[f"{name} (libigl)"] = method(surface.vertices, surface.faces, surface.uv)
+            except RuntimeError as error:
+                self.console.print(f"  {name} of libigl failed: {error}")
+        for name, uv in maps.items():
+            result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
+        result.metrics["nsm"].update(result.certificate)
+
+    def picture(self, module: Any) -> np.ndarray:
+        uv = module(torch.as_tensor(self.surface.uv, dtype=torch.float32, device=module.device))
+        image = layout_image(self.surface, uv.detach().cpu().double().numpy())
         return np.round(255 * image).astype(np.uint8)
 
-    pictures = Pictures("layout", picture, config.logger.pictures)
-    trainer = train(config, folder, surface, module, console, pictures, resuming=resuming)
-
-    def made() -> Parameterization:
-        return Parameterization(phi, frozen(module.map), {}, plain(config))
-
-    result, certificate = certified(config, trainer, module, made, console)
-    maps = {"domain": surface.uv, "nsm": result.uv}
-    for name, method in BASELINES.items():
-        try:
-            maps[f"{name} (libigl)"] = method(surface.vertices, surface.faces, surface.uv)
-        except RuntimeError as error:
-            console.print(f"  {name} of libigl failed: {error}")
-    for name, uv in maps.items():
-        result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
-    result.metrics["nsm"].update(result.certificate)
-
-    result.save(folder)
-    if config.artefacts:
-        _write_artefacts(folder, result)
-    figures = {**certificate, "metrics": result.metrics}
-    write_figures(config, folder, surface, trainer, started, figures)
-    console.print(comparison_table(result.metrics))
-    ours = result.metrics["nsm"]
-    if ours["flipped_percent"] == 0 and ours["boundary_self_intersections"]:
-        console.print(
-            "nothing is flipped, but the image overlaps itself; constraints.boundary=fixed forbids"
-        )
-    say_where(console, folder)
-    return result
-
-
-def _write_artefacts(folder: Path, result: Parameterization) -> None:
-    surface = result.phi.surface
-    inside = _into_square(result.uv)
-    for ending, texture in (("obj", None), ("glb", checkerboard())):
-        file = folder / f"parameterized.{ending}"
-        export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
-    picture_file = folder / "checkerboard.png"
-    before_after = {"before: domain Ω": surface.uv, "after": result.uv}
-    parameterization_picture(picture_file, surface, before_after)
-
-
-def build_param(config: DictConfig, phi: NeuralSurface) -> Param:
-    """The param task's module, seeded.
-
-    Raises:
-        NsmError: settings of the network, energy, optimiser or schedule that do not fit together.
-    """
-    surface = phi.surface
-    mesh = (
-        torch.as_tensor(surface.uv, dtype=torch.float32),
-        torch.as_tensor(surface.faces),
-        torch.as_tensor(face_areas(surface.vertices, surface.faces), dtype=torch.float32),
-    )
-    return built(
-        config,
-        lambda common: Param(
-            **with_map(common),
-            domain=config.domain,
-            weights={name: float(w) for name, w in config.energy.weights.items()},
-            **common["constraints"],
-            mesh=mesh,
-            phi=phi.map,
-        ),
-    )
+    def write_artefacts(self, folder: Path, result: Parameterization) -> None:
+        surface = self.surface
+        inside = _into_square(result.uv)
+        for ending, texture in (("obj", None), ("glb", checkerboard())):
+            file = folder / f"parameterized.{ending}"
+            export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
+        before_after = {"before: domain Ω": surface.uv, "after": result.uv}
+        parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
 
 def _into_square(uv: np.ndarray) -> np.ndarray:

@@ -28,13 +28,13 @@ def shared_steps() -> DDPStrategy:
 
     Buffers are the same everywhere, as each follows from the weights: they need not be sent.
     """
-    # that a process failed is told by what it raised
+    # what a failed process raised is reported instead
     logging.getLogger("torch.multiprocessing.spawn").setLevel(logging.ERROR)
     return DDPStrategy(start_method="fork", broadcast_buffers=False, find_unused_parameters=False)
 
 
 class Process(Callback):
-    """What is particular to a process: the first alone logs and prints.
+    """Let the first process alone log and print.
 
     Args:
         console: that of the run.
@@ -52,7 +52,7 @@ class Process(Callback):
             self.console.quiet = True
 
 
-def take_over(trainer: pl.Trainer, data: pl.LightningDataModule, checkpoint: Path) -> None:
+def take_over(trainer: pl.Trainer, checkpoint: Path) -> None:
     """Give the trainer of this process, which has the trained weights, the rest of the state that
     the training ended with."""
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
@@ -61,12 +61,11 @@ def take_over(trainer: pl.Trainer, data: pl.LightningDataModule, checkpoint: Pat
         if callback.state_key in state["callbacks"]:
             callback.load_state_dict(state["callbacks"][callback.state_key])
     trainer.lightning_module.on_load_checkpoint(state)
-    trainer._data_connector.attach_datamodule(trainer.lightning_module, data)
     os.environ.pop("MASTER_PORT", None)  # the next training finds its own
 
 
-def told_by(error: ProcessRaisedException) -> BaseException:
-    """What a process raised: bad input as such, of which it could only send the text."""
+def raised_by(error: ProcessRaisedException) -> BaseException:
+    """What a process raised: bad input as such, though it could only send the text."""
     last = str(error).strip().splitlines()[-1]
     kind, _, message = last.partition(": ")
-    return NsmError(message) if kind.endswith(NsmError.__name__) else error
+    return NsmError(message, kind="failed_process") if kind.endswith(NsmError.__name__) else error

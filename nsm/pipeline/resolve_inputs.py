@@ -1,4 +1,4 @@
-"""From the words that name surfaces and landmarks to neural surfaces with matched landmarks."""
+"""From settings that name surfaces and landmarks to neural surfaces and vertices."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.domains import Surface
+from nsm.domains import Domain, domain
 from nsm.domains.joint_preparation import Mesh, prepare_jointly
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
-from nsm.pipeline.common import accelerator_of, report_surface
-from nsm.pipeline.surface_cache import made_batched
+from nsm.pipeline.configured_surface import report_surface
+from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.landmarks import (
@@ -34,44 +34,52 @@ from nsm.surfaces.loading import load_mesh
 Shape = NeuralSurface | Mesh
 
 
-def read_shape(given: Any, domain: str, key: str) -> Shape:
-    """What a user calls a surface.
+def read_shape(given: Any, domain: Domain, key: str) -> Shape:
+    """The surface that a user names.
 
     Args:
         given: a NeuralSurface; the folder of one; a mesh file; a name of the catalogue; or an
             analytic surface, as ``{"name": ..., parameters}`` or, for a target, by its name.
-        domain: ``disc`` or ``square``.
+        domain: on which the surface has to lie.
         key: the setting's name, for messages.
 
     Raises:
-        NsmError: nothing of these, or one that cannot be read or lies on the other domain.
+        NsmError: nothing of these, or a surface that cannot be read or lies on another domain.
     """
     if given is None:
-        raise NsmError(f"setting {key}: give a mesh file, a catalogue name or a run folder")
+        raise NsmError(
+            f"setting {key}: give a mesh file, a catalogue name or a run folder",
+            kind="missing_setting",
+            key=key,
+        )
     if isinstance(given, dict):
         return analytic_surface(given, domain)
     if not isinstance(given, (NeuralSurface, str, Path)):
         raise NsmError(
             f"setting {key}: a {type(given).__name__} is no surface; give a neural surface, a mesh "
-            "file, a catalogue name or a run folder"
+            "file, a catalogue name or a run folder",
+            kind="wrong_type",
+            key=key,
         )
     if isinstance(given, NeuralSurface):
         ready = given
     else:
-        word = str(given)
-        if (Path(word) / "surface.json").exists() or word.endswith("surface.safetensors"):
-            ready = load_surface(word)
-        elif word in ANALYTIC and key == "target":  # some are also meshes of the catalogue
-            return analytic_surface({"name": word}, domain)
-        elif Path(word).suffix or os.sep in word or Path(word).exists():
-            vertices, faces, log = load_mesh(word)
-            return Mesh(Path(word).stem, vertices, faces, tuple(log))
+        name = str(given)
+        if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
+            ready = load_surface(name)
+        elif name in ANALYTIC and key == "target":  # some are also meshes of the catalogue
+            return analytic_surface({"name": name}, domain)
+        elif Path(name).suffix or os.sep in name or Path(name).exists():
+            vertices, faces, log = load_mesh(name)
+            return Mesh(Path(name).stem, vertices, faces, tuple(log))
         else:
-            return Mesh(word, *catalogue_mesh(word))
-    if str(ready.surface.domain) != domain:
+            return Mesh(name, *catalogue_mesh(name))
+    if ready.surface.domain != domain:
         raise NsmError(
             f"{key}={ready.surface.name}: it lies on the {ready.surface.domain}, but domain="
-            f"{domain}; all surfaces of a map need one domain"
+            f"{domain}; all surfaces of a map need the same domain",
+            kind="wrong_domain",
+            key=key,
         )
     return ready
 
@@ -111,26 +119,38 @@ def _lists(given: Any, count: int) -> list[Any]:
         try:
             lists = [given["source"], given["target"]]
         except KeyError as error:
-            raise NsmError(f"landmarks: {error} is missing beside the other list") from None
+            raise NsmError(
+                f"landmarks: {error} is missing beside the other list",
+                kind="missing_setting",
+                key="landmarks",
+            ) from None
     else:
         lists = as_lists(given)
         if not isinstance(lists, list):
-            raise NsmError("landmarks: neither lists of landmarks nor files")
+            raise NsmError(
+                "landmarks: neither lists of landmarks nor files",
+                kind="wrong_type",
+                key="landmarks",
+            )
         if count == 2 and lists and all(_is_pair(item) for item in lists):
             lists = [[pair[0] for pair in lists], [pair[1] for pair in lists]]
         lists = [read_landmarks(x) if isinstance(x, (str, Path)) else x for x in lists]
-    if not lists:  # as good as None
+    if not lists:
         return [[] for _ in range(count)]
     if len(lists) != count:
-        raise NsmError(f"landmarks: {len(lists)} lists for {count} surfaces; give one for each")
+        raise NsmError(
+            f"landmarks: {len(lists)} lists for {count} surfaces; give one for each",
+            kind="out_of_range",
+            key="landmarks",
+        )
     return lists
 
 
 def _is_pair(item: Any) -> bool:
-    """Whether an entry is a pair of landmarks, as against a whole list of one surface's.
+    """Whether an entry is a pair of landmarks, not a whole list of one surface's.
 
-    Two lists of two vertices each would look the same; as two pairs they say more often what is
-    meant, as pairs are what the documentation shows.
+    Two lists of two vertices each look the same; they are read as pairs, which the documentation
+    shows.
     """
     return isinstance(item, list) and len(item) == 2
 
@@ -146,7 +166,7 @@ def _vertices(given: Landmarks, shape: Shape) -> np.ndarray:
         return as_vertices(given, shape.vertices, shape.name)
     surface = shape.surface
     if isinstance(given, list):
-        surface.preimages(given)  # tells which one is not there
+        surface.preimages(given)  # raises for one that is not there
         as_vertices(surface.cut_vertex[given], surface.vertices, surface.name)
         return np.asarray(given, dtype=np.int64)
     known = np.flatnonzero(surface.source_vertex >= 0)
@@ -157,33 +177,25 @@ def _vertices(given: Landmarks, shape: Shape) -> np.ndarray:
 def neural_surfaces(
     config: DictConfig, shapes: Sequence[Shape], landmarks: Sequence[np.ndarray], console: Console
 ) -> list[NeuralSurface]:
-    """Neural surfaces of the shapes; those that are meshes are prepared together, and overfitted.
+    """Neural surfaces of the shapes; those that are meshes are prepared jointly, and overfitted.
 
     Raises:
         NsmError: a mesh that cannot be prepared.
     """
-    meshes = [(k, s) for k, s in enumerate(shapes) if isinstance(s, Mesh)]
-    result: list[NeuralSurface | None] = [None if isinstance(s, Mesh) else s for s in shapes]
+    meshes = {k: shape for k, shape in enumerate(shapes) if isinstance(shape, Mesh)}
+    ready = {k: shape for k, shape in enumerate(shapes) if isinstance(shape, NeuralSurface)}
     if meshes:
-        prepared = _prepare(config, meshes, landmarks)
+        alone = len(meshes) == 1
+        prepared = prepare_jointly(
+            list(meshes.values()),
+            [np.zeros(0, np.int64) if alone else landmarks[k] for k in meshes],
+            domain=domain(config.domain),
+            parameterization=config.surface.parameterization,
+            seam=config.seam.path,
+            seam_landmarks=config.seam.landmarks,
+            cache=config.surface.cache,
+        )
         for surface in prepared:
             report_surface(console, surface)
-        made = made_batched(prepared, config, console, in_one_batch=accelerator_of(config) == "gpu")
-        for (k, _), phi in zip(meshes, made, strict=True):
-            result[k] = phi
-    return [r for r in result if r is not None]
-
-
-def _prepare(
-    config: DictConfig, meshes: Sequence[tuple[int, Mesh]], landmarks: Sequence[np.ndarray]
-) -> list[Surface]:
-    settings = config.surface
-    return prepare_jointly(
-        [mesh for _, mesh in meshes],
-        [landmarks[k] if len(meshes) > 1 else np.zeros(0, np.int64) for k, _ in meshes],
-        domain=config.domain,
-        parameterization=settings.parameterization,
-        seam=config.seam.path,
-        seam_landmarks=config.seam.landmarks,
-        cache=settings.cache,
-    )
+        ready.update(zip(meshes, cached_surfaces(prepared, config, console), strict=True))
+    return [ready[k] for k in range(len(shapes))]

@@ -1,47 +1,63 @@
-"""Neural surfaces that maps are made of: each is made once, and kept in the cache."""
+"""Neural surfaces that maps need: each is made once, and kept in the cache."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from nsm.config import compose_config
-from nsm.domains import Surface
+from nsm.domains import Surface, domain
 from nsm.errors import NsmError
-from nsm.pipeline.common import CHECKPOINT_FILE, Run, configured_surface, plain, report_surface
-from nsm.pipeline.overfit import common_settings, leave_results, overfit_ensemble, overfitted
+from nsm.maps.networks import SKIPS
+from nsm.pipeline.batched import common_settings, member, overfit_ensemble
+from nsm.pipeline.checkpoints import CHECKPOINT_FILE
+from nsm.pipeline.configured_surface import configured_surface, report_surface
+from nsm.pipeline.runner import finish, run_prepared
+from nsm.pipeline.training import Run, accelerator_of, plain
 from nsm.results import NeuralSurface, load_surface
+from nsm.run_directories import passing_folder
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit
 
-# of how neural surfaces are made: to be raised when the same settings come to make others
-_VERSION = 2
+# to be raised when the same settings come to make another neural surface
+_VERSION = 3
 
-# settings that do not change what a neural surface becomes
-_INCIDENTAL = (
-    "surface",
-    "phi",
-    "logger",
-    "resume",
-    "source",
-    "target",
-    "surfaces",
-    "landmarks",
-    "attributes",
-    "artefacts",
-    "seam",
-    "constraints",
-    "certification",
+# settings that make a neural surface what it is; those of the trainer but for how it is run
+_ESSENTIAL = (
+    "task",
+    "domain",
+    "map",
+    "activation",
+    "encoding",
+    "loss_weights",
+    "loss_terms",
+    "sampler",
+    "data",
+    "optimizer",
+    "scheduler",
+    "callbacks",
+    "trainer",
+    "seed",
+)
+_HARDWARE = (
+    "accelerator",
+    "devices",
+    "threads",
+    "progress",
+    "compile",
+    "log_every",
+    "log_pictures",
 )
 
 
@@ -53,101 +69,130 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
     """
     if config.phi.path is not None:
         phi = load_surface(config.phi.path)
-        if str(phi.surface.domain) != config.domain:
+        if phi.surface.domain != domain(config.domain):
             raise NsmError(
-                f"{config.phi.path}: its domain is the {phi.surface.domain}, but domain="
-                f"{config.domain}; give domain={phi.surface.domain}"
+                f"{config.phi.path}: its domain is the {phi.surface.domain}, not the "
+                f"{domain(config.domain)}; give domain={phi.surface.domain}",
+                kind="wrong_domain",
+                key="phi.path",
             )
         return phi
-    return made_once(configured_surface(config), config, console)
-
-
-def made_once(surface: Surface, config: DictConfig, console: Console) -> NeuralSurface:
-    """The neural surface of a prepared one, from the cache if it was made before.
-
-    Raises:
-        NsmError: settings in ``phi.overrides`` that cannot be used.
-    """
+    surface = configured_surface(config)
     report_surface(console, surface)
-    return _made(surface, _settings_of_phi(config), console)
+    return cached_surfaces([surface], config, console)[0]
 
 
-def _made(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurface:
-    folder = _place_of(surface, overfit)
-    with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
-        if is_complete(folder):
-            console.print(f"{surface.name}: neural surface taken from the cache")
-            # equal in Ω, but perhaps of another file, with its own units, place and vertex numbers
-            return replace(load_surface(folder), surface=surface)
-        resuming = (folder / CHECKPOINT_FILE).exists()
-        started = time.monotonic()
-        return overfitted(overfit, folder, surface, console, started, resuming=resuming)
-
-
-def made_batched(
-    surfaces: Sequence[Surface], config: DictConfig, console: Console, *, in_one_batch: bool
+def cached_surfaces(
+    surfaces: Sequence[Surface], config: DictConfig, console: Console
 ) -> list[NeuralSurface]:
-    """As :func:`made_once` of each, but nothing is reported of the prepared ones.
+    """The neural surfaces of prepared ones, from the cache if they were made before.
+
+    On a GPU, those that are missing are trained in one batch, which fills it; a CPU is as fast with
+    one after the other, and keeps more if it is interrupted.
 
     Args:
-        surfaces: prepared ones.
-        config: of the map that wants them.
-        console: told what is done.
-        in_one_batch: train those that are not in the cache together, which fills a GPU; a CPU is
-            as fast with one after the other, and keeps more if it is interrupted.
+        surfaces: prepared and reported ones.
+        config: of the map that needs them.
+        console: where to print.
 
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
-    overfit = _settings_of_phi(config)
-    if in_one_batch and common_settings(plain(overfit)) is not None:
-        places = {_place_of(surface, overfit): surface for surface in surfaces}
-        missing = {p: s for p, s in places.items() if not is_complete(p)}
+    overfit = _overfit_config(config)
+    settings = plain(overfit)
+    if not _cacheable(settings):
+        with passing_folder() as folder:
+            return [
+                _made(surface, overfit, Path(folder) / str(k), console)
+                for k, surface in enumerate(surfaces)
+            ]
+    if accelerator_of(overfit) == "gpu" and common_settings(settings) is not None:
+        folders = {_folder_of(surface, settings): surface for surface in surfaces}
+        missing = {f: surface for f, surface in folders.items() if not is_complete(f)}
         if len(missing) > 1:
             _fill_cache(missing, overfit, console)
-    return [_made(surface, overfit, console) for surface in surfaces]
+    return [_cached(surface, overfit, console) for surface in surfaces]
+
+
+def _cached(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurface:
+    folder = _folder_of(surface, plain(overfit))
+    with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
+        if not is_complete(folder):
+            return _made(surface, overfit, folder, console)
+        console.print(f"{surface.name}: neural surface taken from the cache")
+        # equal in Ω, but perhaps of another file, with its own units, place and vertex numbers
+        return replace(load_surface(folder), surface=surface)
+
+
+def _made(surface: Surface, overfit: DictConfig, folder: Path, console: Console) -> NeuralSurface:
+    run = Run(overfit, folder, resuming=(folder / CHECKPOINT_FILE).exists())
+    started, one = time.monotonic(), member(run, surface, console)
+    phi: NeuralSurface = run_prepared(one.task, run, started)
+    return phi
 
 
 def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Console) -> None:
     started = time.monotonic()
     with ExitStack() as locks:
-        for folder in sorted(missing):  # in one order, whoever else wants them
+        for folder in sorted(missing):  # in one order, whichever process wants them
             locks.enter_context(FileLock(folder.with_suffix(".lock")))
         left = {folder: s for folder, s in missing.items() if not is_complete(folder)}
-        runs = [Run(overfit, folder, resuming=True) for folder in left]
-        if len(runs) < 2 or len({run.stage for run in runs}) > 1 or runs[0].stage is None:
+        members = [member(Run(overfit, f, resuming=True), s, console) for f, s in left.items()]
+        stages = {one.run.stage for one in members}
+        if len(members) < 2 or len(stages) > 1 or None in stages:
             return  # what was begun alone goes on alone
         try:
-            modules, trainer = overfit_ensemble(runs, list(left.values()), console)
+            modules, trainer = overfit_ensemble(members, console)
         except EnsembleSplit as fault:
             console.print(f"{fault}; each goes on alone")
             return
-        for i, (run, surface, module) in enumerate(zip(runs, left.values(), modules, strict=True)):
-            leave_results(overfit, run.folder, surface, module, trainer, console, started, index=i)
+        for index, (one, module) in enumerate(zip(members, modules, strict=True)):
+            finish(one.task, one.run, module, trainer, started, index=index)
 
 
-def _settings_of_phi(config: DictConfig) -> DictConfig:
-    """The settings that the neural surfaces of a map are made with."""
-    words = [
+def _overfit_config(config: DictConfig) -> DictConfig:
+    """The configuration with which the neural surfaces of a map are made."""
+    keys = ("accelerator", "devices", "threads", "precision", "progress")
+    values = {key: config.trainer[key] for key in keys}
+    overrides = [
         "task=overfit",
         "logger=none",
         "artefacts=false",
-        f"domain={config.domain}",
         f"seed={config.seed}",
+        *(f"trainer.{key}={'null' if v is None else v}" for key, v in values.items()),
     ]
-    words += [
-        f"trainer.progress={str(config.trainer.progress).lower()}",
-        f"trainer.devices={config.trainer.devices}",
-    ]
-    return compose_config([*words, *config.phi.overrides])
+    overfit = compose_config([*overrides, *config.phi.overrides])
+    with open_dict(overfit):
+        overfit.domain = config.domain
+    return overfit
 
 
-def _place_of(surface: Surface, overfit: DictConfig) -> Path:
+def _cacheable(settings: dict[str, Any]) -> bool:
+    """Whether settings alone make a neural surface what it is: code of nsm and torch changes with
+    their versions only, a user's own at any time, under the same name."""
+    known = ("nsm.", "torch.")
+    own = [
+        t for t in _targets(settings) if not t.startswith(known) or t.startswith("nsm.extensions")
+    ]
+    return not own and settings["map"]["block"] in SKIPS
+
+
+def _targets(settings: Any) -> Iterator[str]:
+    """All ``_target_`` in settings."""
+    if isinstance(settings, dict):
+        yield from [str(settings["_target_"])] if "_target_" in settings else []
+        for value in settings.values():
+            yield from _targets(value)
+    elif isinstance(settings, list):
+        for value in settings:
+            yield from _targets(value)
+
+
+def _folder_of(surface: Surface, settings: dict[str, Any]) -> Path:
     """Where the cache has, or will have, the neural surface of a prepared one."""
-    settings = {k: v for k, v in plain(overfit).items() if k not in _INCIDENTAL}
-    for key in ("progress", "compile", "devices"):
-        settings["trainer"].pop(key)
-    text = f"{_VERSION} {surface.content_key()}{json.dumps(settings, sort_keys=True)}"
+    key = {name: settings[name] for name in _ESSENTIAL}
+    key["trainer"] = {k: v for k, v in key["trainer"].items() if k not in _HARDWARE}
+    text = f"{_VERSION} {surface.content_key()}{json.dumps(key, sort_keys=True)}"
     folder = cache_folder() / "neural" / hashlib.sha256(text.encode()).hexdigest()[:32]
     folder.parent.mkdir(parents=True, exist_ok=True)
     return folder

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 
 from nsm.errors import NsmError
 from nsm.results.files import flush_folder
-from nsm.results.loggers import log_picture, loggers_of
+from nsm.results.loggers import log_picture, loggers_of, takes_pictures
 from nsm.tasks.ensemble import Ensemble, members
 
 
@@ -34,7 +34,8 @@ class AtomicCheckpoint(Callback):
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        # going on from the end of an epoch, Lightning counts one step too many for the logs
+        # resumed at the end of an epoch, Lightning counts one step too many for the logs; it has no
+        # public way to set the number, and a test fails if this one is gone
         trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -59,17 +60,19 @@ class AtomicCheckpoint(Callback):
             raise NsmError(
                 f"{path}: the checkpoint of step {trainer.global_step} cannot be written "
                 f"({reason}); the one before, if any, is whole. Free some space, then go on with: "
-                f"nsm resume={path.parent}"
+                f"nsm resume={path.parent}",
+                kind="unwritable_file",
+                key=str(path),
             ) from error
 
 
 class GradientWatch(Callback):
-    """Log the gradient's norm, of each of several trainings, and stop by it, where there is one.
+    """Log the gradient's norm, of each training in the batch; a single training can stop by it.
 
     Args:
         every: steps between two values in the log.
         stop_norm: stop when the mean norm of the last ``window`` steps is below; None: never.
-        window: how many steps are averaged.
+        window: the number of steps that are averaged.
     """
 
     def __init__(self, every: int, stop_norm: float | None, window: int) -> None:
@@ -117,17 +120,15 @@ class Pictures(Callback):
     Args:
         name: of the pictures.
         draw: from the module, or that of each of several trainings in one batch, to a picture
-            (H, W, 3) uint8.
-        count: how many pictures in all.
+            (H, W, 3) uint8, or None.
+        count: the number of pictures in all.
     """
 
-    def __init__(
-        self, name: str, draw: Callable[[pl.LightningModule], np.ndarray], count: int
-    ) -> None:
+    def __init__(self, name: str, draw: Callable[[Any], np.ndarray | None], count: int) -> None:
         self.name, self.draw, self.count, self.taken = name, draw, count, 0
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if not trainer.is_global_zero:
+        if not trainer.is_global_zero or not takes_pictures(trainer.loggers):
             return
         share = trainer.global_step / max(1, trainer.max_steps)
         due = int(share * self.count)
@@ -135,8 +136,10 @@ class Pictures(Callback):
             return
         self.taken = due
         for index, module in enumerate(members(pl_module).values()):
-            picture = self.draw(module)  # type: ignore[arg-type]
-            log_picture(loggers_of(trainer.loggers, index), self.name, picture, trainer.global_step)
+            picture = self.draw(module)
+            if picture is not None:
+                loggers = loggers_of(trainer.loggers, index)
+                log_picture(loggers, self.name, picture, trainer.global_step)
 
     def state_dict(self) -> dict[str, Any]:
         return {"taken": self.taken}

@@ -1,4 +1,4 @@
-"""What is done about a training that goes wrong."""
+"""A guard against trainings that diverge."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class DivergenceGuard(Callback):
     """Roll back a step whose loss or gradient is not finite, and go on with smaller steps.
 
     A state is kept in memory, and in the checkpoint, every few steps, once the loss and gradient
-    there are known to be finite. The step that fails changes nothing: weights, optimiser and
+    there are known to be finite. The step that fails changes nothing: weights, optimizer and
     buffers return to the kept state, and all learning rates are halved. Of several trainings in one
-    batch, what fails has to be trained alone, and is then put right so.
+    batch, those that fail have to be trained alone.
 
     Args:
-        console: where each fault is told, in one line.
+        console: where each rollback is printed, in one line.
 
     Attributes:
-        begun: whether training has begun, with all that is in a checkpoint taken up.
+        begun: whether training has begun, with the checkpoint, if any, loaded.
         rollbacks: {step, back_to} of each, for metrics.json.
     """
 
@@ -78,23 +78,30 @@ class DivergenceGuard(Callback):
         self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: Optimizer
     ) -> None:
         step = trainer.global_step
-        _part(module, lambda p: p.grad, f"step {step}: the loss or its gradient is not finite")
+        _split(module, lambda p: p.grad, f"step {step}: the loss or its gradient is not finite")
         if self.good is None:
             raise NsmError(
                 f"the loss or its gradient is not finite at the first step, {step}; check the "
-                "weights of the energies and the numbers in the mesh"
+                "weights of the energies and the numbers in the mesh",
+                kind="not_finite",
             )
         if len(self.rollbacks) >= _TRIES:
             raise NsmError(
                 f"the loss or its gradient is not finite at step {step}, after {_TRIES} returns to "
-                "a good state with smaller steps; lower optimizer.lr, or set trainer.gradient_clip"
+                "a good state with smaller steps; lower optimizer.lr, or set trainer.gradient_clip",
+                kind="not_finite",
+                key="optimizer.lr",
             )
         self._restore(module)
+        # most schedules follow their base rates, others the optimizer's present ones
+        for group in self.good["optimizer"]["param_groups"]:
+            group.update({k: _SMALLER * group[k] for k in ("lr", "max_lr") if k in group})
         optimizer.load_state_dict(copy.deepcopy(self.good["optimizer"]))
         for configured in trainer.lr_scheduler_configs:
             scheduler: Any = configured.scheduler
-            scheduler.base_lrs = [_SMALLER * rate for rate in scheduler.base_lrs]
-        # optimisers pass over parameters without a gradient: momentum moves nothing either
+            if hasattr(scheduler, "base_lrs"):
+                scheduler.base_lrs = [_SMALLER * rate for rate in scheduler.base_lrs]
+        # optimizers skip parameters without a gradient: momentum moves nothing either
         for p in module.parameters():
             p.grad = None
         self.rollbacks.append({"step": step, "back_to": self.good["step"]})
@@ -116,7 +123,7 @@ class DivergenceGuard(Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        parts = getattr(pl_module, "parts", 1)
+        parts = getattr(pl_module, "microbatches", 1)
         if parts != self.microbatches:
             self.microbatches = parts
             self.console.print(
@@ -124,14 +131,14 @@ class DivergenceGuard(Callback):
             )
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """The last update has no step after it that would find it out; the last checkpoint, which
-        is written next, has what it is put right to."""
+        """Check the last update, which no further step checks, before the last checkpoint is
+        written."""
         if trainer.global_step < trainer.max_steps and not trainer.should_stop:
             return
         trained = [p for p in pl_module.parameters() if p.requires_grad]
         if self.good is None or all(bool(torch.isfinite(p).all()) for p in trained):
             return
-        _part(pl_module, lambda p: p if p.requires_grad else None, "the last step was not finite")
+        _split(pl_module, lambda p: p if p.requires_grad else None, "the last step was not finite")
         self._restore(pl_module)
         self.rollbacks.append({"step": trainer.global_step, "back_to": self.good["step"]})
         self.console.print(f"the last step was not finite; back to step {self.good['step']}")
@@ -170,16 +177,16 @@ class DivergenceGuard(Callback):
         self.microbatches = state_dict["parts"]
 
 
-def _part(
-    module: pl.LightningModule, looked_at: Callable[[Tensor], Tensor | None], reason: str
+def _split(
+    module: pl.LightningModule, values: Callable[[Tensor], Tensor | None], reason: str
 ) -> None:
-    """Of several trainings, leave those alone that have something that is not finite; all, where it
-    is not seen which."""
+    """Split several trainings: those with a value that is not finite have to go on alone, or all,
+    where it is not known which."""
     if not isinstance(module, Ensemble):
         return
     bad = []
     for i, one in enumerate(module.each):
-        seen = [t for p in one.parameters() if (t := looked_at(p)) is not None]
+        seen = [t for p in one.parameters() if (t := values(p)) is not None]
         if not all(bool(torch.isfinite(t).all()) for t in seen):
             bad.append(i)
     raise EnsembleSplit(reason, bad or range(len(module.each)))
@@ -187,8 +194,8 @@ def _part(
 
 def guard_of(trainer: pl.Trainer) -> dict[str, Any]:
     """What metrics.json says of a training's faults: rollbacks, and parts of a batch."""
-    watch = next((c for c in trainer.callbacks if isinstance(c, DivergenceGuard)), None)  # type: ignore[attr-defined]
+    guard = next((c for c in trainer.callbacks if isinstance(c, DivergenceGuard)), None)  # type: ignore[attr-defined]
     return {
-        "rollbacks": [] if watch is None else watch.rollbacks,
-        "batch_parts": getattr(trainer.lightning_module, "parts", 1),
+        "rollbacks": [] if guard is None else guard.rollbacks,
+        "batch_parts": getattr(trainer.lightning_module, "microbatches", 1),
     }

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,95 +23,133 @@ from pytorch_lightning.loggers import (
 )
 
 from nsm.errors import NsmError
+from nsm.instantiation import made_with, named_object
 from nsm.results.files import as_json, atomic_write
 
 # which run of W&B or MLflow a folder belongs to, so that resuming goes on with it
 IDENTITY_FILE = "logger.json"
 
 
-def build_loggers(
-    kinds: Sequence[str],
-    folder: Path,
-    settings: Mapping[str, Any],
-    *,
-    project: str,
-    uri: str | None,
-    every: int,
-    first_step: int,
-) -> list[Logger]:
-    """The loggers of a run, with its settings.
+class TensorBoard(TensorBoardLogger):
+    """Event files in the run folder, under ``tensorboard``.
 
     Args:
-        kinds: names of ``LOGGERS``.
-        folder: the run folder, which exists.
-        settings: of the run.
-        project: what W&B calls project, and MLflow experiment.
-        uri: of MLflow's server or store; None: that of MLFLOW_TRACKING_URI, or ``mlruns`` in the
-            working folder.
-        every: steps between two values.
+        folder: the run folder.
         first_step: where the training starts; what an interrupted one logged beyond is dropped.
     """
-    flat = flattened(settings)
+
+    def __init__(self, folder: str | Path, first_step: int = 0) -> None:
+        super().__init__(
+            folder,
+            name="",
+            version="tensorboard",
+            default_hp_metric=False,
+            purge_step=first_step,
+        )
+
+
+class CSV(CSVLogger):
+    """The curves as a table, ``csv/metrics.csv`` in the run folder.
+
+    Args:
+        folder: the run folder.
+        first_step: where the training starts; rows beyond are dropped.
+        every: steps between two values.
+    """
+
+    def __init__(self, folder: str | Path, first_step: int = 0, every: int = 25) -> None:
+        file = Path(folder) / "csv" / "metrics.csv"
+        earlier = []
+        if first_step and file.is_file():
+            with file.open(newline="") as stream:
+                earlier = [row for row in csv.DictReader(stream) if int(row["step"]) < first_step]
+        file.unlink(missing_ok=True)
+        super().__init__(folder, name="", version="csv", flush_logs_every_n_steps=every)
+        for row in earlier:
+            step = int(row.pop("step"))
+            self.log_metrics({name: float(value) for name, value in row.items() if value}, step)
+        self.save()
+
+
+class WandB(WandbLogger):
+    """Weights & Biases (pip install wandb); WANDB_MODE=offline keeps the run on the disk.
+
+    Args:
+        folder: the run folder.
+        project: what W&B calls so.
+    """
+
+    package = "wandb"
+
+    def __init__(self, folder: str | Path, project: str = "nsm") -> None:
+        place = Path(folder)
+        known = _identity(place).get("wandb")
+        super().__init__(project=project, name=place.name, id=known, save_dir=place)
+        _identify(place, wandb=self.experiment.id)
+
+
+class MLflow(MLFlowLogger):
+    """MLflow (pip install mlflow).
+
+    Args:
+        folder: the run folder.
+        project: what MLflow calls experiment.
+        uri: of MLflow's server or store; None: that of MLFLOW_TRACKING_URI, or ``mlruns`` in the
+            working folder.
+    """
+
+    package = "mlflow"
+
+    def __init__(self, folder: str | Path, project: str = "nsm", uri: str | None = None) -> None:
+        place = Path(folder)
+        store = uri or os.environ.get("MLFLOW_TRACKING_URI") or Path("mlruns").absolute().as_uri()
+        known = _identity(place).get("mlflow")
+        super().__init__(project, run_name=place.name, run_id=known, tracking_uri=store)
+        _identify(place, mlflow=self.run_id)
+
+
+def build_loggers(settings: Mapping[str, Any], folder: Path, first_step: int) -> list[Logger]:
+    """The loggers of a run, with its settings logged.
+
+    Args:
+        settings: of the run; ``logger`` has those of each logger, by any name.
+        folder: the run folder, which exists.
+        first_step: where the training starts.
+
+    Raises:
+        NsmError: a logger that cannot be made, or that is none of Lightning's.
+    """
+    flat, every = flattened(settings), settings["trainer"]["log_every"]
     loggers = []
-    for kind in kinds:
-        logger = LOGGERS[kind](folder, project, uri, every, first_step)
-        if first_step == 0 or kind != "mlflow":  # which takes each setting once
+    for name, own in settings["logger"].items():
+        logger = made_with(own, folder=folder, first_step=first_step, every=every)
+        if not isinstance(logger, Logger):
+            raise NsmError(
+                f"setting logger.{name}: a {type(logger).__name__} is no Lightning logger",
+                kind="wrong_type",
+                key=f"logger.{name}",
+            )
+        if first_step == 0 or not isinstance(logger, MLFlowLogger):  # takes each setting once
             logger.log_hyperparams(flat)
         loggers.append(logger)
     return loggers
 
 
-def _tensorboard(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
-    return TensorBoardLogger(
-        folder, name="", version="tensorboard", default_hp_metric=False, purge_step=first
-    )
+def check_packages(settings: Mapping[str, Any]) -> None:
+    """NsmError for a logger whose package is not installed, before any work is done.
 
-
-def _csv(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
-    file = folder / "csv" / "metrics.csv"
-    earlier = []
-    if first and file.is_file():
-        with file.open(newline="") as stream:
-            earlier = [row for row in csv.DictReader(stream) if int(row["step"]) < first]
-    file.unlink(missing_ok=True)
-    logger = CSVLogger(folder, name="", version="csv", flush_logs_every_n_steps=every)
-    for row in earlier:
-        step = int(row.pop("step"))
-        logger.log_metrics({name: float(value) for name, value in row.items() if value}, step)
-    logger.save()
-    return logger
-
-
-def _wandb(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
-    known = _identity(folder).get("wandb")
-    logger = WandbLogger(project=project, name=folder.name, id=known, save_dir=folder)
-    _identify(folder, wandb=logger.experiment.id)
-    return logger
-
-
-def _mlflow(folder: Path, project: str, uri: str | None, every: int, first: int) -> Logger:
-    place = uri or os.environ.get("MLFLOW_TRACKING_URI") or Path("mlruns").absolute().as_uri()
-    known = _identity(folder).get("mlflow")
-    logger = MLFlowLogger(project, run_name=folder.name, run_id=known, tracking_uri=place)
-    _identify(folder, mlflow=logger.run_id)
-    return logger
-
-
-LOGGERS: dict[str, Callable[[Path, str, str | None, int, int], Logger]] = {
-    "tensorboard": _tensorboard,
-    "csv": _csv,
-    "wandb": _wandb,
-    "mlflow": _mlflow,
-}
-
-# packages that do not come with nsm
-_EXTERNAL = ("wandb", "mlflow")
-
-
-def require(kind: str) -> None:
-    """NsmError for a logger whose package is not there; told before any work is done."""
-    if kind in _EXTERNAL and importlib.util.find_spec(kind) is None:
-        raise NsmError(f"logger={kind}: the package {kind} is not installed; pip install {kind}")
+    Args:
+        settings: of the loggers, by name.
+    """
+    for name, own in settings.items():
+        package = getattr(named_object(str(own["_target_"])), "package", None)
+        if package and importlib.util.find_spec(package) is None:
+            raise NsmError(
+                f"setting logger.{name}: the package {package} is not installed; "
+                f"pip install {package}",
+                kind="missing_package",
+                key=package,
+            )
 
 
 def _identity(folder: Path) -> dict[str, Any]:
@@ -125,7 +163,7 @@ def _identify(folder: Path, **words: Any) -> None:
 
 class Distributed(Logger):
     """The loggers of several trainings in one batch: ``NAME@i`` goes to those of training i, as
-    ``NAME``, and what has no such ending to all.
+    ``NAME``, and names without such an ending to all.
 
     Args:
         each: the loggers of each training.
@@ -154,13 +192,14 @@ class Distributed(Logger):
         """Each logger has the settings of its own training."""
 
     def save(self) -> None:
-        for logger in self._all():
+        for logger in self.all():
             logger.save()
 
     def finalize(self, status: str) -> None:
-        close(self._all(), status)
+        close(self.all(), status)
 
-    def _all(self) -> list[Logger]:
+    def all(self) -> list[Logger]:
+        """The loggers of all trainings."""
         return [logger for loggers in self.each for logger in loggers]
 
 
@@ -168,6 +207,14 @@ def loggers_of(loggers: Sequence[Logger], index: int) -> Sequence[Logger]:
     """The loggers of training ``index``, where there are several in one batch, or of the one."""
     first = loggers[0] if loggers else None
     return first.each[index] if isinstance(first, Distributed) else loggers
+
+
+def takes_pictures(loggers: Sequence[Logger]) -> bool:
+    """Whether pictures have a place in any of the logs."""
+    kinds = (TensorBoardLogger, WandbLogger, MLFlowLogger)
+    first = loggers[0] if loggers else None
+    every = first.all() if isinstance(first, Distributed) else loggers
+    return any(isinstance(logger, kinds) for logger in every)
 
 
 def log_picture(loggers: Sequence[Logger], name: str, image: np.ndarray, step: int) -> None:
@@ -200,7 +247,7 @@ def log_figures(
 
 
 def close(loggers: Sequence[Logger], status: str) -> None:
-    """Bring everything to its place; a W&B run would else go on into the next one of a sweep."""
+    """Write what is left; a W&B run would otherwise go on into the next one of a sweep."""
     for logger in loggers:
         logger.finalize(status)
         if isinstance(logger, WandbLogger):
@@ -216,9 +263,8 @@ def _compare(folder: Path, flat: dict[str, Any], figures: dict[str, float], step
     # one it unites the settings and figures of all
     _, start, end = hparams(flat, figures)
     with SummaryWriter(folder) as writer:
-        file = writer._get_file_writer()
-        file.add_summary(start)
-        file.add_summary(end)
+        writer.file_writer.add_summary(start)
+        writer.file_writer.add_summary(end)
         for name, value in figures.items():
             writer.add_scalar(name, value, step)
 

@@ -1,8 +1,10 @@
-"""The tasks as Lightning modules: they compose maps with energies, and nothing else."""
+"""The tasks as Lightning modules: each composes maps with energies into a loss."""
 
 from nsm.tasks.collection_map import CollectionMap
-from nsm.tasks.overfit import Overfit, OverfitEnsemble
+from nsm.tasks.overfit import Overfit
+from nsm.tasks.overfit_ensemble import OverfitEnsemble
 from nsm.tasks.pair_map import PairMap
 from nsm.tasks.param import Param
+from nsm.tasks.terms import Evaluation
 
-__all__ = ["CollectionMap", "Overfit", "OverfitEnsemble", "PairMap", "Param"]
+__all__ = ["CollectionMap", "Evaluation", "Overfit", "OverfitEnsemble", "PairMap", "Param"]

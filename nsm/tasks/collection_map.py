@@ -8,60 +8,78 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Rotated, batched, build_planar
+from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
+from nsm.maps import Rotated, batched
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
-from nsm.tasks.terms import Distortion
+from nsm.tasks.planar import planar_map
+from nsm.tasks.terms import Distortion, Evaluation, Term
+
+# The terms of four surfaces are added up; those of k surfaces are scaled to that many. The default
+# weights were measured with four surfaces.
+_SURFACES = 4
 
 
 class CollectionMap(ConstrainedMap):
-    """Σ over ordered pairs of E(A_i, A_j), A_i = J(φ_i∘h_i)ᵀJ(φ_i∘h_i) (METHOD, Collection).
+    """L = mean over i ≠ j of E(A_i, A_j) + 4/k Σ_i (λ_inv G_i + λ_B B_i + λ_C C_i + λ_seam S_i +
+    λ_tri U_i), A_i = J(φ_i∘h_i)ᵀJ(φ_i∘h_i) (METHOD, Collection).
 
-    F_{i→j}∘φ_i∘h_i = φ_j∘h_j, so each φ_i∘h_i is evaluated once a step, and the k² pairs only
-    meet as 2×2 matrices. Each pair's distortion counts by the area of its source i.
+    F_{i→j}∘φ_i∘h_i = φ_j∘h_j, so each φ_i∘h_i is evaluated once a step, and the k(k − 1) ordered
+    pairs only meet as 2×2 matrices. The distortion of a pair is weighted by the area of its source
+    i. The loss is METHOD's sum over all ordered pairs, divided by k(k − 1): each surface takes
+    part in 2(k − 1) pairs, so its energy and its constraints have the same proportion for all k,
+    and the loss does not grow with k. Four is the number of surfaces for which the default weights
+    were measured. Multipliers are scaled like the term C.
 
     Args:
-        map: configuration of each h_i's network.
+        map, activation, encoding: settings of each h_i's network.
         optimizer, scheduler: settings (see :mod:`nsm.tasks.optimizers`).
-        max_steps, domain, weights, constraints: see :class:`nsm.tasks.constrained.ConstrainedMap`.
+        max_steps, domain, energy, loss_weights, constraints, loss_terms: see
+            :class:`nsm.tasks.constrained.ConstrainedMap`.
         points: (K, 2) landmarks in the common domain.
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
-        turns: (k, 2, 2) rotations of the inputs.
+        rotations: (k, 2, 2), of the inputs.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
-        diagonals: of each surface's bounding box, the units of the errors that are logged.
+        diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
 
     Raises:
-        ValueError: a setting that is not known.
+        ValueError: a constraint that is not known.
     """
 
     def __init__(
         self,
         map: dict[str, Any],
+        activation: dict[str, Any],
+        encoding: dict[str, Any],
         optimizer: dict[str, Any],
         scheduler: dict[str, Any],
         max_steps: int,
-        domain: str,
-        weights: dict[str, float],
+        loss_weights: dict[str, float],
         constraints: dict[str, Any],
+        domain: Any,
+        energy: Any,
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
-        turns: Tensor,
+        rotations: Tensor,
         mesh: tuple[Tensor, Tensor],
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
+        loss_terms: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(domain, weights, constraints, max_steps)
-        given = ["phis", "points", "targets", "seam", "turns", "mesh"]
+        super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "rotations", "mesh"]
         self.save_hyperparameters(ignore=given, logger=False)
-        planar = {**map, "onto": self.constraints.onto(domain)}
-        self.map = nn.ModuleList(Rotated(build_planar(planar), turn) for turn in turns)
+        onto = domain if self.exact else None
+        self.map = nn.ModuleList(
+            Rotated(planar_map(onto, map, activation, encoding), rotation) for rotation in rotations
+        )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
-        self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh) for _ in phis)
-        self.hold(points, targets, points @ turns.transpose(1, 2), seam)
+        margin = self.constraints.fold_margin
+        self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh, margin=margin) for _ in phis)
+        self.set_landmarks(points, targets, points @ rotations.transpose(1, 2), seam)
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
@@ -72,42 +90,70 @@ class CollectionMap(ConstrainedMap):
         return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
-        distortion, determinant, images = self._distortion(batch)
-        held = self.constraints
-        terms = {"injectivity": injectivity(determinant).mean(dim=1).sum()}
-        if held.boundary == "penalty":
-            stray = outside(self.domain, images).mean(dim=1).sum()
-            terms["boundary"] = (
-                boundary(self.domain, self(self.boundary_samples)).mean(dim=1).sum() + stray
-            )
-        if len(self.seam) and held.lambda_seam > 0:
-            terms["seam"] = self._seam_gap()
-        if held.lambda_triangles > 0:
-            both = zip(self.map, self.fold_barrier, strict=True)
-            terms["triangles"] = torch.stack([w(h, self.global_step) for h, w in both]).sum()
-        return self.total(distortion, terms)
+        w, ramp, scale = self.loss_weights, self.ramp, _SURFACES / len(self.map)
+        distortion, evaluation = self._evaluated(batch)
+        energy = distortion.mean
+        # sums over the surfaces
+        G = injectivity(evaluation.determinant).mean(dim=1).sum()
+        B = 0.0 if self.exact else self._boundary_term(evaluation.image)
+        S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
+        U = self._triangle_term() if w.triangles > 0 else 0.0
+        C, multipliers = self.landmark_terms()
 
-    def _distortion(self, x: Tensor) -> tuple[Distortion, Tensor, Tensor]:
-        """Energy of the ordered pairs at points (N, 2), all det J_h (k, N), and all h (k, N, 2)
-        there."""
-        forms, determinants, everywhere = (
+        loss = energy + scale * (
+            multipliers
+            + w.injectivity * G
+            + w.boundary * B
+            + ramp * w.seam * S
+            + w.triangles * U
+            + w.landmarks * C
+        )
+        terms: dict[str, Term] = {
+            **distortion.terms,
+            "multipliers": (scale, multipliers),
+            "injectivity": (scale * w.injectivity, G),
+            "boundary": (scale * w.boundary, B),
+            "seam": (scale * ramp * w.seam, S),
+            "triangles": (scale * w.triangles, U),
+            "landmarks": (scale * w.landmarks, C),
+        }
+        for name, term in self.loss_terms.items():
+            terms[name] = (term.weight, term(evaluation))
+            loss = loss + term.weight * terms[name][1]
+        self.log_terms(loss, terms, distortion=energy)
+        return loss
+
+    def _evaluated(self, x: Tensor) -> tuple[Distortion, Evaluation]:
+        """Energy of the ordered pairs at points (N, 2), and what it is made from, of each surface:
+        tensors (k, N, ...)."""
+        forms, determinants, images, positions = (
             part.transpose(0, 1) for part in self.pointwise(self._at, x)
         )
         # samples lie by the mean of the surfaces' areas: weights make it that of each source
         area = torch.linalg.det(forms.detach()).clamp(min=0).sqrt()
         share = area / area.mean(dim=0).clamp(min=1e-12)
-        if self.constraints.boundary == "penalty":  # samples that went astray do not count
-            share = share * inside(self.domain, everywhere.detach()).all(dim=0)
+        if not self.exact:  # samples that a map sends out of Ω do not count
+            share = share * inside(self.domain, images.detach()).all(dim=0)
         i, j = self.ordered
-        parts = self.energy.parts(forms[i], forms[j])
-        return Distortion(self.energy, parts, share[i]), determinants, everywhere
+        parts = self.energy.parts(forms[i], forms[j], At(images[i], positions[i]))
+        evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
+        return Distortion(self.energy, parts, share[i]), evaluation
 
-    def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A_i (N, k, 2, 2), det J_h (N, k) and h (N, k, 2) of all surfaces at points (N, 2)."""
+    def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """A_i (N, k, 2, 2), det J_h (N, k), h (N, k, 2) and φ∘h (N, k, 3) of all surfaces at points
+        (N, 2)."""
         images, inner = batched(list(self.map)).value_and_jacobian(x.expand(len(self.map), -1, -1))
-        _, outer = batched(list(self.phis)).value_and_jacobian(images)
+        positions, outer = batched(list(self.phis)).value_and_jacobian(images)
         metrics = first_fundamental_form(outer @ inner)
-        return tuple(part.transpose(0, 1) for part in (metrics, torch.linalg.det(inner), images))  # type: ignore[return-value]
+        parts = metrics, torch.linalg.det(inner), images, positions
+        return tuple(part.transpose(0, 1) for part in parts)  # type: ignore[return-value]
+
+    def _boundary_term(self, images: Tensor) -> Tensor:
+        """Σ over surfaces of the mean squared distance of h(∂Ω) to ∂Ω, and of samples outside Ω to
+        Ω."""
+        stray = outside(self.domain, images).mean(dim=1).sum()
+        off = boundary(self.domain, self(self.boundary_samples)).mean(dim=1).sum()
+        return off + stray
 
     def _seam_gap(self) -> Tensor:
         """Σ over surfaces of the mean squared distance between a seam point's two copies."""
@@ -116,12 +162,16 @@ class CollectionMap(ConstrainedMap):
         )
         return ((a - b) ** 2).sum(dim=-1).mean(dim=1).sum()
 
+    def _triangle_term(self) -> Tensor:
+        both = zip(self.map, self.fold_barrier, strict=True)
+        return torch.stack([barrier(h, self.global_step) for h, barrier in both]).sum()
+
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
-        self.log_validation(*self._distortion(batch))
+        self.log_validation(*self._evaluated(batch))
 
     def flipped_percent(self) -> Tensor:
         both = zip(self.map, self.fold_barrier, strict=True)
-        return torch.stack([w.flipped_percent(h) for h, w in both]).mean()  # type: ignore[operator]
+        return torch.stack([b.flipped_percent(h) for h, b in both]).mean()  # type: ignore[operator]
 
     def landmark_error(self) -> Tensor:
         phis = batched(list(self.phis))

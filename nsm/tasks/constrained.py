@@ -1,166 +1,131 @@
-"""What maps between surfaces share: constraints on planar maps, and how they set in."""
+"""What maps between surfaces share: how the planar map h is constrained (METHOD, B, G, C)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nsm.domains import bounded
-from nsm.energies import Blend, inside, landmark
-from nsm.tasks.fold_barrier import carefully, stronger
-from nsm.tasks.optimizers import configure
-from nsm.tasks.terms import Distortion, HeldOut, Term
+from nsm.energies import inside, landmark
+from nsm.settings import PairConstraints, PairWeights
+from nsm.tasks.fold_barrier import further_training, stronger
+from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
 
-BOUNDARIES = ("exact", "penalty")
-LANDMARKS = ("augmented", "fixed")
-# Float32 places a point of the boundary this well, and no better.
+# float32 places a point of the boundary no better than this
 _ON_BOUNDARY = 1e-6
-
-
-@dataclass(frozen=True)
-class Constraints:
-    """How maps of the domain are held (METHOD, B, G, C).
-
-    Attributes:
-        boundary: ``exact``, h keeps to Ω by construction; or ``penalty``, λ_B mean σ(h(∂Ω)) is
-            added, and samples that h sends out of Ω leave the distortion and are pulled back.
-        landmarks: ``augmented``, multipliers are updated every ``multiplier_every`` steps once
-            the ramp is over (augmented Lagrangian), so that landmarks are met whatever λ_C is; or
-            ``fixed``, λ_C alone.
-        multiplier_every: steps between two updates of the multipliers.
-        ramp: share of the steps in which the landmarks' targets move from where the start has
-            them to where they belong, and λ_seam grows from zero: pulled at once, h would fold.
-        lambda_injectivity, lambda_boundary, lambda_landmarks, lambda_seam, lambda_triangles: the
-            weights λ_inv, λ_B, λ_C, that of the seam's gap on the target, and that of the mesh
-            triangles nearest to folding (:class:`nsm.tasks.fold_barrier.FoldBarrier`).
-
-    Raises:
-        ValueError: a word that is not known, or a ramp outside [0, 1].
-    """
-
-    boundary: str
-    landmarks: str
-    multiplier_every: int
-    ramp: float
-    lambda_injectivity: float
-    lambda_boundary: float
-    lambda_landmarks: float
-    lambda_seam: float
-    lambda_triangles: float
-
-    def __post_init__(self) -> None:
-        for value, known in ((self.boundary, BOUNDARIES), (self.landmarks, LANDMARKS)):
-            if value not in known:
-                raise ValueError(f"{value!r} is not one of {', '.join(known)}")
-        if not 0 <= self.ramp <= 1:
-            raise ValueError(f"constraints.ramp {self.ramp} is not in [0, 1]")
-
-    def onto(self, domain: str) -> str | None:
-        """The domain that h keeps to by construction, if it does."""
-        return domain if self.boundary == "exact" else None
 
 
 class ConstrainedMap(Training):
     """Base of the tasks that map surfaces to surfaces.
 
-    Subclasses set ``map``, call ``hold`` with the landmarks, sum their terms by ``total``, and
-    answer ``flipped_percent`` and ``landmark_error``.
+    With ``constraints.boundary=exact``, h maps Ω to itself by construction; with ``penalty``,
+    λ_B times the mean squared distance of h(∂Ω) to ∂Ω is added, and samples that h maps out of Ω
+    leave the distortion and are pulled back. With ``constraints.landmarks=augmented``, multipliers
+    are updated every ``multiplier_every`` steps once the ramp is over (augmented Lagrangian), so
+    that landmarks are met whatever λ_C is; with ``fixed``, λ_C acts alone. During the ramp, a share
+    of the steps, the landmarks' targets move from where h has them at its start to their places,
+    and the seam's weight grows from zero: with the full terms at once, h would fold.
+
+    Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
+    ``landmark_error``.
 
     Args:
-        domain: ``disc`` or ``square``.
-        weights: energies by name with their weights (see :mod:`nsm.energies`).
-        constraints: of :class:`Constraints`.
+        domain: Ω (see :class:`nsm.domains.Domain`).
+        energy: of the metrics A and B (see :mod:`nsm.energies`).
+        loss_weights: of :class:`nsm.settings.PairWeights`: λ_inv, λ_B, λ_C, λ_seam of the squared
+            gap along the seam, and λ_tri of triangles that are near to folding.
+        constraints: of :class:`nsm.settings.PairConstraints`.
         max_steps: length of the run.
+        loss_terms: the user's own (see :mod:`nsm.tasks.terms`).
 
     Raises:
-        ValueError: a setting that is not known.
+        ValueError: a constraint that is not known.
     """
 
-    progress_figure, progress_form = "val/distortion", "distortion {:.3f}"
+    Weights, Constraints = PairWeights, PairConstraints
     points: Tensor
     targets: Tensor
     start: Tensor
     seam: Tensor
-    rim: Tensor
+    boundary_samples: Tensor
     multipliers: Tensor
 
     def __init__(
         self,
-        domain: str,
-        weights: dict[str, float],
+        domain: Any,
+        energy: Any,
+        loss_weights: dict[str, float],
         constraints: dict[str, Any],
         max_steps: int,
+        loss_terms: dict[str, Any] | None,
     ) -> None:
         super().__init__()
-        self.domain, self.energy = domain, Blend(weights)
+        self.domain, self.energy = domain, as_blend(energy)
+        self.loss_weights = PairWeights(**loss_weights)
+        self.constraints = PairConstraints(**constraints)
+        self.loss_terms = made_terms(loss_terms or {})
         self.held_out = HeldOut()
-        self.constraints = Constraints(**constraints)
         self.ramp_steps = self.constraints.ramp * max_steps
+        # h maps Ω to itself by construction
+        self.exact = self.constraints.boundary == "exact"
 
-    def hold(self, points: Tensor, targets: Tensor, start: Tensor, seam: Tensor) -> None:
-        """Take landmarks: points (K, 2), their targets and where h has them at its start
+    def set_landmarks(self, points: Tensor, targets: Tensor, start: Tensor, seam: Tensor) -> None:
+        """Register landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point."""
-        named = {"points": points, "targets": targets, "start": start, "seam": seam}
-        named["boundary_samples"] = bounded(self.domain).boundary_samples()
-        for name, tensor in named.items():
+        given = {"points": points, "targets": targets, "start": start, "seam": seam}
+        if not self.exact:
+            given["boundary_samples"] = self.domain.boundary_samples()
+        for name, tensor in given.items():
             self.register_buffer(name, tensor, persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
 
     @property
-    def ramped(self) -> float:
-        """How far, from 0 to 1, landmarks and seam have come on the way to their full demand."""
+    def ramp(self) -> float:
+        """From 0 to 1: how far the landmarks' targets and the seam's weight have come."""
         return min(1.0, self.global_step / self.ramp_steps) if self.ramp_steps else 1.0
 
-    def total(self, distortion: Distortion, terms: dict[str, Tensor]) -> Tensor:
-        """The loss, with each term by its λ and, if there are any, with the landmarks; logged."""
-        every: dict[str, Term] = dict(distortion.terms)
-        if len(self.points):
-            moved = self(self.points)
-            wanted = self.start + self.ramped * (self.targets - self.start)
-            terms = {**terms, "landmarks": landmark(moved, wanted).sum()}
-            if self.constraints.landmarks == "augmented":
-                every["multipliers"] = (1.0, (self.multipliers * (moved - wanted)).sum())
-        for name, value in terms.items():
-            share = self.ramped if name == "seam" else 1.0
-            every[name] = (share * getattr(self.constraints, f"lambda_{name}"), value)
-        self.note({"distortion": distortion.mean})
-        return self.summed(every)
+    def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
+        """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target on the ramp;
+        0.0 where there are none."""
+        if not len(self.points):
+            return 0.0, 0.0
+        moved = self(self.points)
+        wanted = self.start + self.ramp * (self.targets - self.start)
+        multipliers: Tensor | float = 0.0
+        C = landmark(moved, wanted).sum()
+        if self.constraints.landmarks == "augmented":
+            multipliers = (self.multipliers * (moved - wanted)).sum()
+        return C, multipliers
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         held = self.constraints
-        if held.landmarks != "augmented" or not len(self.points) or self.ramped < 1:
+        if held.landmarks != "augmented" or not len(self.points) or self.ramp < 1:
             return
         if self.global_step % held.multiplier_every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
-                self.multipliers += 2 * held.lambda_landmarks * off
+                self.multipliers += 2 * self.loss_weights.landmarks * off
 
     def strengthen(self, steps: int) -> None:
-        """Set up for a further training of what is nearly there: all demands in full, those on
-        triangles tenfold and on more of them, in small steps."""
-        held = self.constraints
-        self.constraints = replace(held, lambda_triangles=stronger(held.lambda_triangles))
+        """Prepare a further training of a nearly injective map: the ramp is over, the weight of
+        folding triangles is ten times as large and acts on more of them, in small steps."""
+        self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = 0.0
-        carefully(self, steps)
+        further_training(self, steps)
 
-    def log_validation(self, distortion: Distortion, determinant: Tensor, image: Tensor) -> None:
-        """Log what is followed on held-out points: energy, and the shares of folds and of strays.
-
-        Args:
-            distortion: there.
-            determinant: det J_h (..., N).
-            image: h (..., N, 2).
-        """
-        count = image.shape[-2]
+    def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:
+        """Log held-out figures: distortion, folds, and samples outside Ω."""
+        determinant, images = evaluation.determinant, evaluation.image
+        count = determinant.shape[-1]
         self.held_out.add(distortion)
-        folded, stray = determinant <= 0, ~inside(self.domain, image, tolerance=_ON_BOUNDARY)
         self.log("val/distortion", distortion.mean, batch_size=count)
-        self.log("val/folded_percent", 100 * folded.double().mean(), batch_size=count)
-        self.log("val/outside_percent", 100 * stray.double().mean(), batch_size=count)
+        folded = 100 * (determinant <= 0).double().mean()
+        self.log("val/folded_percent", folded, batch_size=count)
+        if self.domain.has_boundary:
+            stray = ~inside(self.domain, images, tolerance=_ON_BOUNDARY)
+            self.log("val/outside_percent", 100 * stray.double().mean(), batch_size=count)
 
     def on_validation_epoch_end(self) -> None:
         self.log("val/distortion_median", self.held_out.median())
@@ -177,6 +142,3 @@ class ConstrainedMap(Training):
     def landmark_error(self) -> Tensor:
         """Distance of landmarks from their targets, on the surface, in percent of its diagonal."""
         raise NotImplementedError
-
-    def configure_optimizers(self) -> Any:
-        return configure(self.map, self.hparams)  # type: ignore[arg-type]

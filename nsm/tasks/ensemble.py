@@ -8,7 +8,8 @@ from typing import Any, cast
 import pytorch_lightning as pl
 from torch import Tensor, nn
 
-from nsm.tasks.optimizers import Shares, in_one, scheduled
+from nsm.tasks.joint_optimizer import Shares, in_one
+from nsm.tasks.schedules import scheduled
 from nsm.tasks.training import Training
 
 
@@ -28,13 +29,13 @@ class EnsembleSplit(Exception):
 class Ensemble(Training):
     """Base of k trainings in one batch.
 
-    The loss is the sum of theirs, no network sees another's share of it, and the optimiser's step
-    of a parameter depends on that parameter alone, so that each becomes what it would alone. What
-    is logged as ``NAME@i`` is the figure ``NAME`` of training i. A checkpoint is that of training
-    ``shown``, as it would be alone, and the training goes on from one of each.
+    The loss is the sum of theirs, no network depends on another's share of it, and the optimizer's
+    step of a parameter depends on that parameter alone, so that each becomes what it would alone.
+    What is logged as ``NAME@i`` is the figure ``NAME`` of training i. A checkpoint is that of
+    training ``shown``, as it would be alone, and the training goes on from one of each.
 
     Args:
-        each: their modules, with the same settings but for the optimiser's rates and what the task
+        each: their modules, with the same settings but for the optimizer's rates and what the task
             allows to differ.
 
     Attributes:
@@ -56,19 +57,19 @@ class Ensemble(Training):
         self.shares = Shares(joint, own)
         return scheduled(joint, each[0].hparams)
 
-    def logged(self, figures: Mapping[str, Tensor], batch_size: int | None = None) -> None:
+    def log_figures(self, figures: Mapping[str, Tensor], batch_size: int | None = None) -> None:
         """Log figures (k,), one for each training."""
         self.log_dict(
             {
                 f"{name}@{i}": value
                 for name, values in figures.items()
                 for i, value in enumerate(values)
-                if self.tells(i, name)
+                if self.has_figure(i, name)
             },
             batch_size=batch_size,
         )
 
-    def tells(self, index: int, name: str) -> bool:
+    def has_figure(self, index: int, name: str) -> bool:
         """Whether a training has a figure of that name."""
         return True
 
@@ -90,7 +91,7 @@ class Ensemble(Training):
             "state_dict": self.weights_of(checkpoint["state_dict"], self.shown),
             "optimizer_states": [self.shares.of_optimizer(optimizer, self.shown)],
             "lr_schedulers": [self.shares.of_schedule(schedule, self.shown)],
-            one.CHECKPOINT_HYPER_PARAMS_NAME: one._hparams_name,
+            one.CHECKPOINT_HYPER_PARAMS_NAME: "kwargs",  # as Lightning calls them
             one.CHECKPOINT_HYPER_PARAMS_KEY: dict(one.hparams),
         }
 

@@ -1,8 +1,10 @@
-"""The triangles of a mesh that a planar map is nearest to folding."""
+"""A barrier against folds: the triangles of a mesh that a planar map is nearest to folding."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
 
 import pytorch_lightning as pl
 import torch
@@ -25,7 +27,9 @@ class FoldBarrier(nn.Module):
     Args:
         uv: (V, 2) vertices of the mesh in Ω.
         faces: (F, 3), counter-clockwise.
-        areas: (F,) what counts as each triangle's own area; that in Ω by default.
+        areas: (F,) of each triangle before the map; by default its area in Ω.
+        margin: relative signed area under which a triangle is penalised (see
+            :func:`nsm.energies.unfold`).
     """
 
     uv: Tensor
@@ -33,8 +37,11 @@ class FoldBarrier(nn.Module):
     area: Tensor
     chosen: Tensor
 
-    def __init__(self, uv: Tensor, faces: Tensor, areas: Tensor | None = None) -> None:
+    def __init__(
+        self, uv: Tensor, faces: Tensor, areas: Tensor | None = None, margin: float = 0.1
+    ) -> None:
         super().__init__()
+        self.margin = margin
         self.register_buffer("uv", uv, persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         double = _double_areas(uv[faces]) if areas is None else 2 * areas
@@ -42,7 +49,7 @@ class FoldBarrier(nn.Module):
         self.watch(_COUNT)
 
     def watch(self, count: int) -> None:
-        """Hold so many triangles open at once."""
+        """Act on so many triangles at once."""
         # in the state, so that resumed training goes on with the same ones
         chosen = torch.arange(min(count, len(self.faces)), device=self.faces.device)
         self.register_buffer("chosen", chosen)
@@ -55,10 +62,10 @@ class FoldBarrier(nn.Module):
         corners = self.uv[self.faces[self.chosen]]
         image = h(corners.reshape(-1, 2)).reshape(-1, 3, 2)
         relative = _double_areas(image) / self.area[self.chosen]
-        return unfold(relative).mean()
+        return unfold(relative, self.margin).mean()
 
     def _look(self, h: Callable[[Tensor], Tensor], number: int) -> None:
-        """Choose anew, among all triangles or, of a large mesh, a part of them and the last."""
+        """Choose among all triangles or, of a large mesh, among a part of them and those chosen."""
         faces, area, index = self.faces, self.area, None
         if len(faces) <= _LOOK:
             image = h(self.uv)
@@ -86,13 +93,17 @@ def _double_areas(corners: Tensor) -> Tensor:
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
 
 
-def stronger(weight: float) -> float:
-    """λ_triangles for a further training: tenfold, and not zero."""
-    return max(10 * weight, 100.0)
+Weights = TypeVar("Weights")
 
 
-def carefully(module: pl.LightningModule, steps: int) -> None:
-    """Watch four times as many triangles, and train at a tenth of the rates for so many steps."""
+def stronger(weights: Weights) -> Weights:
+    """Loss weights for a further training: λ_tri is ten times as large, and not zero."""
+    triangles = max(10 * weights.triangles, 100.0)  # type: ignore[attr-defined]
+    return replace(weights, triangles=triangles)  # type: ignore[type-var]
+
+
+def further_training(module: pl.LightningModule, steps: int) -> None:
+    """Prepare so many steps at a tenth of the rates, with four times as many triangles watched."""
     for part in module.modules():
         if isinstance(part, FoldBarrier):
             part.watch(4 * part.chosen.shape[-1])
@@ -101,5 +112,6 @@ def carefully(module: pl.LightningModule, steps: int) -> None:
         if optimizer.get(rate) is not None:
             optimizer[rate] *= 0.1
     scheduler = module.hparams["scheduler"]
-    scheduler["warmup"] = min(scheduler.get("warmup", 0), steps // 10)
+    if "warmup" in scheduler:
+        scheduler["warmup"] = min(scheduler["warmup"], steps // 10)
     module.hparams["max_steps"] = steps

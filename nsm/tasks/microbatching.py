@@ -34,8 +34,8 @@ class Microbatching(pl.LightningModule):
     that of the whole batch, also where it is no sum over points.
 
     Attributes:
-        microbatches: how many parts a batch is evaluated in; kept in the checkpoint, so that a
-            resumed training goes on the same way.
+        microbatches: the number of parts that a batch is evaluated in; kept in the checkpoint, so
+            that a resumed training goes on the same way.
     """
 
     microbatches: int = 1
@@ -67,14 +67,16 @@ class Microbatching(pl.LightningModule):
         """Lightning's step, repeated in smaller parts while memory runs out.
 
         Raises:
-            NsmError: even parts of a few points do not fit, or not the optimiser's own state.
+            NsmError: even parts of a few points do not fit, or not the optimizer's own state.
         """
         assert optimizer_closure is not None
         while not self._stepped(epoch, batch_idx, optimizer, optimizer_closure):
             if self.microbatches >= _MOST:
                 raise NsmError(
                     f"out of memory, even with a batch in {self.microbatches} parts; lower "
-                    "data.batch_size or map.width"
+                    "data.batch_size or map.width",
+                    kind="out_of_memory",
+                    key="data.batch_size",
                 )
             self.microbatches *= 2
             gc.collect()
@@ -100,18 +102,22 @@ class Microbatching(pl.LightningModule):
                 raise
             if self.trainer.world_size > 1:  # the other processes cannot be asked to try again
                 raise NsmError(
-                    "out of memory in one of several processes; lower data.batch_size or map.width"
+                    "out of memory in one of several processes; lower data.batch_size or map.width",
+                    kind="out_of_memory",
+                    key="data.batch_size",
                 ) from error
             if evaluated:  # some weights may have moved: trying again would move them twice
                 raise NsmError(
-                    "out of memory for the optimiser's own values; lower map.width or "
-                    "encoding.resolutions, or choose optimizer=sgd"
+                    "out of memory for the optimizer's own values; lower map.width or "
+                    "encoding.resolutions, or choose optimizer=sgd",
+                    kind="out_of_memory",
+                    key="optimizer",
                 ) from error
             return False
         return True
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["nsm_parts"] = self.microbatches
+        checkpoint["microbatches"] = self.microbatches
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.microbatches = int(checkpoint.get("nsm_parts", 1))
+        self.microbatches = int(checkpoint["microbatches"])

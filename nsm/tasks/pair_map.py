@@ -8,91 +8,118 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Composition, Rotated, build_planar
+from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
+from nsm.maps import Composition, Rotated
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
-from nsm.tasks.terms import Distortion
+from nsm.tasks.planar import planar_map
+from nsm.tasks.terms import Distortion, Evaluation, Term
 
 
 class PairMap(ConstrainedMap):
-    """L = mean E(A, B) + λ_inv G + λ_C C + λ_seam ‖ψ(h(a)) − ψ(h(b))‖² + λ_tri U (METHOD, B, G, C).
+    """L = mean E(A, B) + λ_inv G + λ_B B + λ_C C + λ_seam S + λ_tri U (METHOD, B, G, C).
 
-    A = J_φᵀJ_φ and B = J(ψ∘h)ᵀJ(ψ∘h) at samples of the source; U keeps its mesh's triangles from
-    folding.
+    A = J_φᵀJ_φ and B = J(ψ∘h)ᵀJ(ψ∘h) at samples of the source; S = mean ‖ψ(h(a)) − ψ(h(b))‖² over
+    the two copies a, b of a seam point; U keeps the source mesh's triangles from folding.
 
     Args:
-        map: configuration of h's network.
+        map, activation, encoding: settings of h's network.
         optimizer, scheduler: settings (see :mod:`nsm.tasks.optimizers`).
-        max_steps, domain, weights, constraints: see :class:`nsm.tasks.constrained.ConstrainedMap`.
+        max_steps, domain, energy, loss_weights, constraints, loss_terms: see
+            :class:`nsm.tasks.constrained.ConstrainedMap`.
         points, targets: landmarks P (L, 2) and Q (L, 2) in the domains of source and target.
         seam: (T, 2, 2) pairs of points of ∂Ω that are one point of the source, and whose images
             should be one point of the target.
-        turn: rotation (2, 2) of h's input (see :mod:`nsm.tasks.initial_rotation`).
+        rotation: (2, 2), of h's input (see :mod:`nsm.tasks.initial_rotation`).
         mesh: uv (V, 2) and faces (F, 3) of the source, whose triangles must not flip.
-        diagonal: of the target's bounding box, the unit of the errors that are logged.
+        diagonal: of the target's bounding box, the unit of the logged errors.
         phi, psi: source and target; neither is trained.
 
     Raises:
-        ValueError: a setting that is not known.
+        ValueError: a constraint that is not known.
     """
 
     def __init__(
         self,
         map: dict[str, Any],
+        activation: dict[str, Any],
+        encoding: dict[str, Any],
         optimizer: dict[str, Any],
         scheduler: dict[str, Any],
         max_steps: int,
-        domain: str,
-        weights: dict[str, float],
+        loss_weights: dict[str, float],
         constraints: dict[str, Any],
+        domain: Any,
+        energy: Any,
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
-        turn: Tensor,
+        rotation: Tensor,
         mesh: tuple[Tensor, Tensor],
         diagonal: float,
         phi: nn.Module,
         psi: nn.Module,
+        loss_terms: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(domain, weights, constraints, max_steps)
-        given = ["phi", "psi", "points", "targets", "seam", "turn", "mesh"]
+        super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
+        given = ["domain", "energy", "phi", "psi", "points", "targets", "seam", "rotation", "mesh"]
         self.save_hyperparameters(ignore=given, logger=False)
-        self.map = Rotated(build_planar({**map, "onto": self.constraints.onto(domain)}), turn)
+        h = planar_map(domain if self.exact else None, map, activation, encoding)
+        self.map = Rotated(h, rotation)
         self.phi = phi.eval().requires_grad_(False)
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
-        self.fold_barrier = FoldBarrier(*mesh)
+        self.fold_barrier = FoldBarrier(*mesh, margin=self.constraints.fold_margin)
         self.diagonal = diagonal
-        self.hold(points, targets, points @ turn.T, seam)
+        self.set_landmarks(points, targets, points @ rotation.T, seam)
 
     def forward(self, uv: Tensor) -> Tensor:
         """h: (N, 2) points of Ω to (N, 2) in the target's domain."""
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
-        distortion, determinant, image = self._distortion(batch.uv)
-        held = self.constraints
-        terms = {"injectivity": injectivity(determinant).mean()}
-        if held.boundary == "penalty":
-            stray = outside(self.domain, image).mean()
-            terms["boundary"] = (
-                boundary(self.domain, self.map(self.boundary_samples)).mean() + stray
-            )
-        if len(self.seam) and held.lambda_seam > 0:
-            terms["seam"] = self._seam_gap()
-        if held.lambda_triangles > 0:
-            terms["triangles"] = self.fold_barrier(self.map, self.global_step)
-        return self.total(distortion, terms)
+        w, ramp = self.loss_weights, self.ramp
+        distortion, evaluation = self._evaluated(batch)
+        energy = distortion.mean
+        G = injectivity(evaluation.determinant).mean()
+        B = 0.0 if self.exact else self._boundary_term(evaluation.image)
+        S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
+        U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
+        C, multipliers = self.landmark_terms()
 
-    def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor, Tensor]:
-        """Energy at points (N, 2) of Ω, det J_h (N,) and h (N, 2) there."""
-        source, target, jacobian, image = self.pointwise(self._at, uv)
-        parts = self.energy.parts(source, target)
-        if self.constraints.boundary == "penalty":  # samples that went astray do not count
-            kept = inside(self.domain, image)
+        loss = (
+            energy
+            + multipliers
+            + w.injectivity * G
+            + w.boundary * B
+            + ramp * w.seam * S
+            + w.triangles * U
+            + w.landmarks * C
+        )
+        terms: dict[str, Term] = {
+            **distortion.terms,
+            "multipliers": (1.0, multipliers),
+            "injectivity": (w.injectivity, G),
+            "boundary": (w.boundary, B),
+            "seam": (ramp * w.seam, S),
+            "triangles": (w.triangles, U),
+            "landmarks": (w.landmarks, C),
+        }
+        for name, term in self.loss_terms.items():
+            terms[name] = (term.weight, term(evaluation))
+            loss = loss + term.weight * terms[name][1]
+        self.log_terms(loss, terms, distortion=energy)
+        return loss
+
+    def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
+        """The energy at samples of the source, and what it is made from."""
+        A, B, jacobian, h = self.pointwise(self._at, batch.uv)
+        parts = self.energy.parts(A, B, At(batch.uv, batch.points))
+        if not self.exact:  # samples that h maps out of Ω do not count
+            kept = inside(self.domain, h)
             parts = {name: part[kept] for name, part in parts.items()}
-        return Distortion(self.energy, parts), torch.linalg.det(jacobian), image
+        det = torch.linalg.det(jacobian)
+        return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A, B, J_h and h at points (N, 2) of Ω."""
@@ -102,13 +129,18 @@ class PairMap(ConstrainedMap):
         _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
         return source, first_fundamental_form(outer @ jacobian), jacobian, image
 
+    def _boundary_term(self, image: Tensor) -> Tensor:
+        """Mean squared distance of h(∂Ω) to ∂Ω, and of samples outside Ω to Ω."""
+        stray = outside(self.domain, image).mean()
+        return boundary(self.domain, self.map(self.boundary_samples)).mean() + stray
+
     def _seam_gap(self) -> Tensor:
         """Mean squared distance on the target between the images of a seam point's two copies."""
         a, b = self.image(self.seam.reshape(-1, 2)).reshape(-1, 2, 3).unbind(dim=1)
         return ((a - b) ** 2).sum(dim=1).mean()
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        self.log_validation(*self._distortion(batch.uv))
+        self.log_validation(*self._evaluated(batch))
 
     def flipped_percent(self) -> Tensor:
         return self.fold_barrier.flipped_percent(self.map)

@@ -8,103 +8,112 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import Blend, first_fundamental_form, injectivity
-from nsm.maps import build_planar
-from nsm.tasks.fold_barrier import FoldBarrier, carefully, stronger
-from nsm.tasks.optimizers import configure
-from nsm.tasks.terms import Distortion, HeldOut, Term
+from nsm.energies import At, first_fundamental_form, injectivity
+from nsm.settings import ParamConstraints, ParamWeights
+from nsm.tasks.fold_barrier import FoldBarrier, further_training, stronger
+from nsm.tasks.planar import planar_map
+from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
 from nsm.tasks.training import Training
-
-BOUNDARIES = ("free", "fixed")
 
 
 class Param(Training):
     """L = mean E(A, B) + λ_inv mean G(det J_h) + λ_tri U, A = J_φᵀJ_φ, B = J_hᵀJ_h (METHOD, Param).
 
     U keeps the mesh's triangles from folding (:class:`nsm.tasks.fold_barrier.FoldBarrier`). With a
-    fixed boundary h keeps to Ω by construction, and the image of ∂Ω slides on ∂Ω: a map that folds
-    nowhere is then bijective.
+    fixed boundary h maps Ω to itself by construction, and the image of ∂Ω slides on ∂Ω: a map that
+    folds nowhere is then bijective.
 
     Args:
-        map: configuration of h's network.
+        map, activation, encoding: settings of h's network.
         optimizer, scheduler: settings (see :mod:`nsm.tasks.optimizers`).
         max_steps: length of the schedule.
-        domain: ``disc`` or ``square``.
-        weights: energies by name with their weights (see :mod:`nsm.energies`).
-        lambda_injectivity, lambda_triangles: λ_inv and λ_tri.
-        boundary: ``free`` or ``fixed``.
+        loss_weights: of :class:`nsm.settings.ParamWeights`.
+        constraints: of :class:`nsm.settings.ParamConstraints`.
+        domain: Ω (see :class:`nsm.domains.Domain`).
+        energy: of the metrics A and B (see :mod:`nsm.energies`).
         mesh: uv (V, 2), faces (F, 3) and areas (F,) of the mesh whose triangles must not flip.
         phi: the surface; it is not trained.
+        loss_terms: the user's own (see :mod:`nsm.tasks.terms`).
 
     Raises:
-        ValueError: an energy or a boundary that is not known.
+        ValueError: a constraint that is not known.
     """
 
-    progress_figure, progress_form = "val/distortion", "distortion {:.3f}"
+    Weights, Constraints = ParamWeights, ParamConstraints
 
     def __init__(
         self,
         map: dict[str, Any],
+        activation: dict[str, Any],
+        encoding: dict[str, Any],
         optimizer: dict[str, Any],
         scheduler: dict[str, Any],
         max_steps: int,
-        domain: str,
-        weights: dict[str, float],
-        lambda_injectivity: float,
-        lambda_triangles: float,
-        boundary: str,
+        loss_weights: dict[str, float],
+        constraints: dict[str, Any],
+        domain: Any,
+        energy: Any,
         mesh: tuple[Tensor, Tensor, Tensor],
         phi: nn.Module,
+        loss_terms: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["phi", "mesh"], logger=False)
-        if boundary not in BOUNDARIES:
-            raise ValueError(f"boundary {boundary!r} is not one of {', '.join(BOUNDARIES)}")
-        self.energy = Blend(weights)
-        self.map = build_planar({**map, "onto": domain if boundary == "fixed" else None})
+        self.save_hyperparameters(ignore=["domain", "energy", "phi", "mesh"], logger=False)
+        self.loss_weights = ParamWeights(**loss_weights)
+        fixed = ParamConstraints(**constraints).boundary == "fixed"
+        self.map = planar_map(domain if fixed else None, map, activation, encoding)
+        self.energy = as_blend(energy)
+        self.loss_terms = made_terms(loss_terms or {})
         self.phi = phi.eval().requires_grad_(False)
-        self.lambda_injectivity, self.lambda_triangles = lambda_injectivity, lambda_triangles
         self.fold_barrier = FoldBarrier(*mesh)
         self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
-        """(N, 2) points of Ω to the plane."""
+        """h: (N, 2) points of Ω to the plane."""
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
-        distortion, determinant = self._distortion(batch.uv)
-        fold = injectivity(determinant).mean()
+        w = self.loss_weights
+        distortion, evaluation = self._evaluated(batch)
+        energy = distortion.mean
+        G = injectivity(evaluation.determinant).mean()
+        U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
+
+        loss = energy + w.injectivity * G + w.triangles * U
         terms: dict[str, Term] = {
             **distortion.terms,
-            "injectivity": (self.lambda_injectivity, fold),
+            "injectivity": (w.injectivity, G),
+            "triangles": (w.triangles, U),
         }
-        if self.lambda_triangles > 0:
-            terms["triangles"] = (
-                self.lambda_triangles,
-                self.fold_barrier(self.map, self.global_step),
-            )
-        self.note({"distortion": distortion.mean})
-        return self.summed(terms)
+        for name, term in self.loss_terms.items():
+            terms[name] = (term.weight, term(evaluation))
+            loss = loss + term.weight * terms[name][1]
+        self.log_terms(loss, terms, distortion=energy)
+        return loss
 
-    def _distortion(self, uv: Tensor) -> tuple[Distortion, Tensor]:
-        """Energy at points (N, 2) of Ω, and det J_h (N,) there; φ's work is not recorded."""
-        source, jacobian = self.pointwise(self._at, uv)
-        parts = self.energy.parts(source, first_fundamental_form(jacobian))
-        return Distortion(self.energy, parts), torch.linalg.det(jacobian)
+    def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
+        """The energy at samples, and what it is made from; φ's part is not recorded."""
+        A, jacobian, h = self.pointwise(self._at, batch.uv)
+        B = first_fundamental_form(jacobian)
+        parts = self.energy.parts(A, B, At(batch.uv, batch.points))
+        det = torch.linalg.det(jacobian)
+        return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
-    def _at(self, uv: Tensor) -> tuple[Tensor, Tensor]:
+    def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A, J_h and h at points (N, 2) of Ω."""
         with torch.no_grad():
             source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
-        return source, self.map.value_and_jacobian(uv)[1]
+        h, jacobian = self.map.value_and_jacobian(uv)
+        return source, jacobian, h
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
-        self.lambda_triangles = stronger(self.lambda_triangles)
-        carefully(self, steps)
+        self.loss_weights = stronger(self.loss_weights)
+        further_training(self, steps)
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        distortion, determinant = self._distortion(batch.uv)
-        folded = 100 * (determinant <= 0).double().mean()
+        distortion, evaluation = self._evaluated(batch)
+        folded = 100 * (evaluation.determinant <= 0).double().mean()
         self.held_out.add(distortion)
         self.log("val/distortion", distortion.mean, batch_size=len(batch.uv))
         self.log("val/folded_percent", folded, batch_size=len(batch.uv))
@@ -112,6 +121,3 @@ class Param(Training):
     def on_validation_epoch_end(self) -> None:
         self.log("val/distortion_median", self.held_out.median())
         self.log("val/flipped_percent", self.fold_barrier.flipped_percent(self.map))
-
-    def configure_optimizers(self) -> Any:
-        return configure(self.map, self.hparams)

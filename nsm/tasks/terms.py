@@ -1,15 +1,91 @@
-"""The terms of a loss, and distortion at samples."""
+"""The terms of a loss: distortion at samples, and a user's own."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nsm.energies import Blend
+from nsm.errors import NsmError
+from nsm.instantiation import made
 
-Term = tuple[float | Tensor, Tensor]
+Term = tuple[float | Tensor, Tensor | float]  # weight and value; a term that is absent is 0.0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a user's own loss term sees of a step, at N samples (of a collection: (k, N)).
+
+    Attributes:
+        uv: (N, 2) points of Ω.
+        position: (N, 3) points of the surface there.
+        image: what the trained map makes of uv: φ (N, 3) for overfit, h (N, 2) for all others.
+        source: (N, 2, 2) metric A of the source; None for overfit.
+        target: (N, 2, 2) metric B of the image; None for a collection, whose targets are many.
+        determinant: (N,) det J_h; None for overfit.
+    """
+
+    uv: Tensor
+    position: Tensor
+    image: Tensor
+    source: Tensor | None = None
+    target: Tensor | None = None
+    determinant: Tensor = None  # type: ignore[assignment]
+
+
+class LossTerm(nn.Module):
+    """A user's own loss term: from an :class:`Evaluation` to values (N,) or a scalar.
+
+    Args:
+        function: the term; if it is a module, it moves to the training's device.
+        weight: its weight in the loss.
+    """
+
+    def __init__(self, function: Callable[[Evaluation], Tensor], weight: float) -> None:
+        super().__init__()
+        self.function, self.weight = function, weight
+
+    def forward(self, evaluation: Evaluation) -> Tensor:
+        """The mean of the term over the samples, a scalar."""
+        return self.function(evaluation).mean()
+
+
+def made_terms(settings: Mapping[str, Mapping[str, Any]]) -> nn.ModuleDict:
+    """The user's own terms by name.
+
+    Args:
+        settings: by name, ``_target_`` and its parameters, and ``weight`` (1 by default).
+
+    Raises:
+        NsmError: a term that cannot be made.
+    """
+    terms = nn.ModuleDict()
+    for name, given in settings.items():
+        rest = dict(given)
+        weight = rest.pop("weight", 1.0)
+        function = made(rest)
+        if not callable(function):
+            raise NsmError(
+                f"setting loss_terms.{name}: it is not callable with an Evaluation",
+                kind="wrong_type",
+                key=f"loss_terms.{name}",
+            )
+        terms[name] = LossTerm(function, float(weight))
+    return terms
+
+
+def as_blend(energy: Any) -> Blend:
+    """An energy as a blend of one, under its class's name in lower case: symmetric_dirichlet."""
+    if isinstance(energy, Blend):
+        return energy
+    name = getattr(energy, "__name__", type(energy).__name__)
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    return Blend(weights={name: 1.0}, terms={name: energy})
 
 
 @dataclass(frozen=True)
@@ -19,7 +95,7 @@ class Distortion:
     Attributes:
         blend: the energies and their weights.
         parts: each energy by name, without its weight, (..., N).
-        share: what each sample counts, (..., N); None: all alike.
+        share: the weight of each sample, (..., N); None: all equal.
     """
 
     blend: Blend
@@ -34,7 +110,7 @@ class Distortion:
 
     @property
     def terms(self) -> dict[str, Term]:
-        """The mean of each energy with its weight, as terms of a loss."""
+        """The mean of each energy with its weight."""
         weights = self.blend.weights
         return {f"distortion_{n}": (weights[n], self._mean(v)) for n, v in self.parts.items()}
 
@@ -50,7 +126,7 @@ class Distortion:
 
 
 def mean_of_processes(amount: Tensor) -> Tensor:
-    """The mean of what each process of a training has, without a gradient.
+    """The mean of an amount over the processes of a training, without a gradient.
 
     Gradients are averaged over the processes: a sum over a process's samples, divided by this mean
     of their weights, counts for the mean over all samples.
@@ -63,20 +139,20 @@ def mean_of_processes(amount: Tensor) -> Tensor:
 
 
 class HeldOut:
-    """Distortion at held-out points, gathered over the batches of one look at them."""
+    """Distortion at held-out points, gathered over the batches of one validation."""
 
     def __init__(self) -> None:
         self._values: list[Tensor] = []
         self._shares: list[Tensor] = []
 
     def add(self, distortion: Distortion) -> None:
-        """Take in a batch."""
+        """Add a batch."""
         values, share = distortion.values.detach(), distortion.share
         self._values.append(values.flatten())
         self._shares.append((torch.ones_like(values) if share is None else share).flatten())
 
     def median(self) -> Tensor:
-        """The least value with half of the weight at or below it; forgets what it was made of."""
+        """The least value with half of the weight at or below it; the batches are dropped."""
         values, order = torch.cat(self._values).sort()
         weight = torch.cat(self._shares)[order].double().cumsum(dim=0)
         self._values, self._shares = [], []

@@ -1,25 +1,35 @@
-"""What all tasks share: figures of the training, taken where they are wanted."""
+"""What all tasks share: the logged figures, compiled evaluation, the optimizer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 from torch import Tensor
 
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.microbatching import Microbatching
+from nsm.tasks.optimizers import configure
 from nsm.tasks.terms import Term
 
 
 class Training(Microbatching):
-    """Base of the tasks.
+    """Base of the tasks' modules, which train ``self.map``.
 
     Attributes:
-        log_every: steps between two values that the logger takes; in the steps between, Lightning
-            would spend as long on figures as the network on its work.
-        compiled: calls evaluations of a training step in a compiled form; None: as they are.
+        Weights: the dataclass of the task's ``loss_weights``.
+        Constraints: the dataclass of its ``constraints``; None: it has none.
+        progress_figure, progress_form: the logged figure beside the progress bar, and its format.
+        log_every: steps between two logged values; logging each step would take Lightning as long
+            as the network takes for its work.
+        compiled: calls evaluations of a training step in compiled form; None: uncompiled.
     """
 
+    Weights: ClassVar[type]
+    Constraints: ClassVar[type | None] = None
+    progress_figure, progress_form = "val/distortion", "distortion {:.3f}"
+    map: Any
+    loss_terms: Any  # ModuleDict of nsm.tasks.terms.LossTerm
     log_every = 1
     compiled: Compiled | None = None
 
@@ -31,28 +41,31 @@ class Training(Microbatching):
             return self.compiled(function, x)
         return super().pointwise(function, x)
 
-    def note(self, figures: Mapping[str, Tensor], kind: str = "train") -> None:
-        """Log figures of a training step as ``KIND/NAME``, in the steps that the logger takes."""
-        if (self.global_step + 1) % self.log_every == 0:
-            self.logged({f"{kind}/{name}": value for name, value in figures.items()})
+    def log_terms(self, loss: Tensor, terms: Mapping[str, Term], **figures: Tensor) -> None:
+        """Log a training step, in the steps that the logger takes.
 
-    def logged(self, figures: Mapping[str, Tensor], batch_size: int | None = None) -> None:
-        """Log figures as they are called; means over batches weigh each by its size."""
-        self.log_dict(dict(figures), batch_size=batch_size)
-
-    def summed(self, terms: Mapping[str, Term]) -> Tensor:
-        """The loss Σ λ·term, logged with its terms.
-
-        Each term goes to the log as it is, ``train/NAME``, and times its λ, ``weighted/NAME``; the
+        Each term is logged as it is, ``train/NAME``, and times its weight, ``weighted/NAME``; the
         latter add up to ``train/loss``.
 
         Args:
-            terms: by name, λ and the term, a scalar, or (k,) of trainings in one batch, as is the
-                loss then.
+            loss: a scalar, or (k,) of k trainings in one batch, as are the terms.
+            terms: by name, weight and value; those that are 0.0 are absent, and not logged.
+            figures: further ones, logged as ``train/NAME``.
         """
-        parts = {name: weight * value for name, (weight, value) in terms.items()}
-        first, *rest = parts.values()
-        loss = sum(rest, start=first)
-        self.note({**{name: value for name, (_, value) in terms.items()}, "loss": loss})
-        self.note(parts, "weighted")
-        return loss
+        if (self.global_step + 1) % self.log_every:
+            return
+        there = {name: pair for name, pair in terms.items() if isinstance(pair[1], Tensor)}
+        values = {name: value for name, (_, value) in there.items()}
+        self.log_figures(
+            {
+                **{f"train/{name}": v for name, v in {**figures, **values, "loss": loss}.items()},
+                **{f"weighted/{name}": weight * value for name, (weight, value) in there.items()},
+            }
+        )
+
+    def log_figures(self, figures: Mapping[str, Any], batch_size: int | None = None) -> None:
+        """Log figures under their names; means over batches weigh each by its size."""
+        self.log_dict(dict(figures), batch_size=batch_size)
+
+    def configure_optimizers(self) -> Any:
+        return configure(self.map, self.hparams)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from thorough import examples
 from tiny import dome
 
-from nsm.data import OverfitData, SurfaceSampler
+from nsm.data import CollectionData, Sampler, SurfaceData, SurfaceSampler
 from nsm.domains import Surface
 from nsm.surfaces.location import locate
 
@@ -55,14 +55,15 @@ def test_a_share_uniform_in_the_domain_has_the_mixed_density(uneven):
     surface = dataclasses.replace(uneven, uv=np.stack([u, uneven.vertices[:, 1]], axis=1))
     sampler = SurfaceSampler(surface)
     for share in (0.0, 0.4, 1.0):
-        points = sampler.draw(40_000, 0.0, sampler.generator(0), domain_share=share).points
+        draws = Sampler(domain_share=share)
+        points = draws.draw(sampler, 40_000, sampler.generator(0)).points
         left = float((points[:, 0] < 0).float().mean())
         assert left == pytest.approx(0.5 * (1 - share) + 0.75 * share, abs=0.01)
 
 
 def test_samples_lie_on_the_surface_with_its_normals(uneven):
     sampler = SurfaceSampler(uneven)
-    samples = sampler.draw(1000, 0.3, sampler.generator(1))
+    samples = Sampler(0.3).draw(sampler, 1000, sampler.generator(1))
     assert len(samples.uv) == len(samples.points) == len(samples.normals) == 1000
     assert torch.allclose(samples.points[:, 2], torch.tensor(0.0), atol=1e-6)
     assert torch.allclose(samples.normals.abs()[:, 2], torch.tensor(1.0), atol=1e-6)
@@ -113,28 +114,29 @@ def test_jacobians_are_finite_where_single_precision_loses_a_triangle(uneven):
 
 
 def test_a_batch_depends_on_seed_and_step_alone(uneven):
-    first, again = (OverfitData(uneven, batch_size=64, seed=3) for _ in range(2))
+    first, again = (SurfaceData(uneven, batch_size=64, seed=3) for _ in range(2))
     first.setup()
     again.setup()
     first.batch(0)
     assert torch.equal(first.batch(7).points, again.batch(7).points)
     assert not torch.equal(first.batch(7).points, first.batch(8).points)
-    other = OverfitData(uneven, batch_size=64, seed=4)
+    other = SurfaceData(uneven, batch_size=64, seed=4)
     other.setup()
     assert not torch.equal(first.batch(7).points, other.batch(7).points)
 
 
 def test_pool_holds_every_vertex(uneven):
-    data = OverfitData(uneven, batch_size=64, pool=1000)
+    data = SurfaceData(uneven, Sampler(pool=1000), batch_size=64)
     data.setup()
-    assert len(data.pool.points) == 1000
-    assert float(nearest(data.sampler.vertices, data.pool.points).max()) < 1e-6
+    pool = data.own_sampler.fixed
+    assert len(pool.points) == 1000
+    assert float(nearest(data.points.vertices, pool.points).max()) < 1e-6
     batch = data.batch(0)
-    assert float(nearest(batch.points, data.pool.points).max()) < 1e-6
+    assert float(nearest(batch.points, pool.points).max()) < 1e-6
 
 
 def test_held_out_points_are_not_trained_on(uneven):
-    data = OverfitData(uneven, batch_size=512, held_out=512)
+    data = SurfaceData(uneven, batch_size=512, held_out=512)
     data.setup()
     held_out = torch.cat([chunk.uv for chunk in data.val_dataloader()])
     assert len(held_out) == 512
@@ -149,7 +151,8 @@ DOME = dome(0.5, 3)
 @given(st.integers(0, 200), st.floats(0, 1), st.integers(0, 2**62), st.integers(0, 10**9))
 def test_any_draw_lies_on_the_surface_and_comes_again(count, share, seed, step):
     sampler = SurfaceSampler(DOME)
-    samples = sampler.draw(count, share, sampler.generator(seed, step))
+    draws = Sampler(share)
+    samples = draws.draw(sampler, count, sampler.generator(seed, step))
     assert [len(part) for part in samples] == [count] * 3
     assert all(part.isfinite().all() for part in samples)
     assert (samples.uv.norm(dim=1) <= 1 + 1e-6).all()
@@ -157,5 +160,36 @@ def test_any_draw_lies_on_the_surface_and_comes_again(count, share, seed, step):
     places = locate(samples.uv.double().numpy(), DOME.uv, DOME.faces)
     there = places.take(DOME.vertices, DOME.faces)
     assert np.allclose(there, samples.points.numpy(), atol=1e-5)
-    again = sampler.draw(count, share, sampler.generator(seed, step))
+    again = draws.draw(sampler, count, sampler.generator(seed, step))
     assert all(torch.equal(a, b) for a, b in zip(samples, again, strict=True))
+
+
+class Corners:
+    """A user's own sampler: the first vertices, in turn."""
+
+    def draw(self, surface, count, generator):
+        return surface.at_vertices(torch.arange(count) % len(surface.vertices))
+
+
+def test_a_users_own_sampler_needs_one_method():
+    data = SurfaceData(DOME, Corners(), batch_size=8)
+    data.setup()
+    assert torch.equal(data.batch(3).points, data.points.vertices[:8])
+    shared = CollectionData(
+        [DOME] * 3,
+        torch.eye(2).expand(3, 2, 2),
+        Corners(),
+        batch_size=9,
+        steps_per_epoch=1,
+        held_out=9,
+    )
+    shared.setup()
+    assert torch.equal(shared.batch(0), data.points.uv[:3].repeat(3, 1))
+
+
+@pytest.mark.parametrize("settings", [{"vertex_share": 1.5}, {"pool": 0}, {"domain_share": -1}])
+def test_a_sampler_refuses_shares_that_are_none(settings):
+    with pytest.raises(ValueError):
+        Sampler(**settings)
+    with pytest.raises(ValueError):
+        Sampler(vertex_share=0.6, domain_share=0.6)

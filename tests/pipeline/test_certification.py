@@ -1,4 +1,4 @@
-"""Maps that a training leaves folded: repaired, or told as such."""
+"""Maps that a training leaves folded: repaired, or reported as such."""
 
 import json
 
@@ -6,22 +6,23 @@ import numpy as np
 import pytest
 
 import nsm
+from nsm.domains import Disc
 from nsm.pipeline import certification
-from nsm.results import analytic
 from nsm.results.analytic import analytic_surface
+from nsm.surfaces.shapes import ring_mesh
 
 QUICK = ["experiment=quick", "data.held_out=512", "trainer.threads=1"]
 
 CROSSED = [[0.5, 0.0], [-0.5, 0.1], [0.0, 0.5], [0.1, -0.6]]  # swapped in pairs: a half turn inside
-FORCED = ["constraints.ramp=0", "constraints.lambda_triangles=0", "constraints.lambda_seam=0"]
-FORCED += ["constraints.lambda_injectivity=0", "constraints.lambda_landmarks=1.0e+4"]
+FORCED = ["constraints.ramp=0", "loss_weights.triangles=0", "loss_weights.seam=0"]
+FORCED += ["loss_weights.injectivity=0", "loss_weights.landmarks=1.0e+4"]
 FORCED += ["trainer.gradient_clip=null", "optimizer.lr=0.01", "trainer.max_steps=80"]
 
 
 @pytest.fixture
 def ends(monkeypatch):
-    monkeypatch.setattr(analytic, "_RINGS", 12)
-    return [analytic_surface({"name": name}, "disc") for name in ("plane", "paraboloid")]
+    monkeypatch.setattr(Disc, "mesh", lambda self, rings=12: ring_mesh(rings))
+    return [analytic_surface({"name": name}, Disc()) for name in ("plane", "paraboloid")]
 
 
 def forced(ends, folder, *words):

@@ -18,12 +18,13 @@ from tiny import results
 
 import nsm
 from nsm.config import compose_config
+from nsm.domains import Disc
 from nsm.errors import NsmError
-from nsm.pipeline import run_collection_map, run_overfit, run_pair_map, run_param
+from nsm.pipeline import Given, run_task
 from nsm.pipeline.folder_lock import folder_lock
-from nsm.results import analytic
 from nsm.results.analytic import analytic_surface
 from nsm.results.files import read_pair, write_pair
+from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks import Overfit, microbatching
 
 WORDS = ["experiment=quick", "data.steps_per_epoch=10", "data.held_out=64", "data.batch_size=64"]
@@ -33,14 +34,14 @@ WORDS += ["trainer.progress=false", "trainer.max_steps=60"]
 
 @pytest.fixture
 def surface(monkeypatch):
-    monkeypatch.setattr(analytic, "_RINGS", 6)
-    plain = analytic_surface({"name": "paraboloid"}, "disc").surface
+    monkeypatch.setattr(Disc, "mesh", lambda self, rings=6: ring_mesh(6))
+    plain = analytic_surface({"name": "paraboloid"}, Disc()).surface
     return replace(plain, quality={"median_symmetric_dirichlet": 4.0})
 
 
 def run(surface, folder, *words, resuming=False):
     config = compose_config(["task=overfit", *WORDS, *words])
-    return run_overfit(config, folder, surface, resuming=resuming)
+    return run_task(config, folder, Given(surface=surface), resuming=resuming)
 
 
 def weights(folder):
@@ -107,16 +108,18 @@ def test_the_state_goes_back_to_the_one_that_was_kept(surface, tmp_path, monkeyp
 
 def test_it_gives_up_with_one_line_after_a_few_tries(surface, tmp_path, monkeypatch):
     spoil(monkeypatch, lambda step: step >= 20, FAULTS["loss is NaN"])
-    with pytest.raises(NsmError, match="after 5 returns.*lower optimizer.lr") as error:
+    with pytest.raises(NsmError) as error:
         run(surface, tmp_path)
+    assert (error.value.kind, error.value.key) == ("not_finite", "optimizer.lr")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "metrics.json").exists()
 
 
 def test_a_first_step_that_is_not_finite_has_nothing_to_go_back_to(surface, tmp_path, monkeypatch):
     spoil(monkeypatch, lambda step: True, FAULTS["loss is NaN"])
-    with pytest.raises(NsmError, match="at the first step"):
+    with pytest.raises(NsmError) as error:
         run(surface, tmp_path)
+    assert (error.value.kind, error.value.key) == ("not_finite", None)
 
 
 def test_a_last_step_that_is_not_finite_is_not_in_the_checkpoint(surface, tmp_path, monkeypatch):
@@ -245,15 +248,17 @@ def mapped(task, folder, resuming=False):
     phi, psi, _ = neural = tiny_surfaces()
     config = compose_config([f"task={task}", *MAP_WORDS])
     if task == "param":
-        result = run_param(config, folder, phi, resuming=resuming)
+        result = run_task(config, folder, Given(phi=phi), resuming=resuming)
         return {**result.map.state_dict(), "uv": torch.from_numpy(result.uv)}
     if task == "collection_map":
         marks = [[0, 9], [0, 8], [0, 9]]
-        trio = run_collection_map(config, folder, neural, marks, resuming=resuming)
+        given = Given(surfaces=neural, landmarks=marks)
+        trio = run_task(config, folder, given, resuming=resuming)
         found = {(i, key): w for i, h in enumerate(trio.maps) for key, w in h.state_dict().items()}
         images = {(i, j): trio.pair(i, j).image_uv for i, j in permutations(range(3), 2)}
         return found | {ends: torch.from_numpy(uv) for ends, uv in images.items()}
-    result = run_pair_map(config, folder, phi, psi, [(0, 0), (9, 8)], resuming=resuming)
+    given = Given(source=phi, target=psi, landmarks=[(0, 0), (9, 8)])
+    result = run_task(config, folder, given, resuming=resuming)
     return {**result.map.state_dict(), "uv": torch.from_numpy(result.image_uv)}
 
 
@@ -348,14 +353,15 @@ def test_an_artefact_written_over_another_is_the_one_or_the_other(tmp_path, call
 
 
 @pytest.mark.parametrize("part", ["state_dict", "optimizer_states", "loops", "callbacks"])
-def test_a_checkpoint_of_another_make_is_told_in_one_line(surface, tmp_path, part):
+def test_a_checkpoint_of_another_make_is_refused(surface, tmp_path, part):
     """As of a stranger, or of a network that has other layers."""
     run(surface, tmp_path, "trainer.max_steps=10")
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)
     state[part] = {name: 3 for name in state[part]} if part == "callbacks" else {"x": 1}
     torch.save(state, tmp_path / "last.ckpt")
-    with pytest.raises(NsmError, match=r"last\.ckpt: damaged") as error:
+    with pytest.raises(NsmError) as error:
         run(surface, tmp_path, resuming=True)
+    assert error.value.kind == "damaged_file" and error.value.key == str(tmp_path / "last.ckpt")
     assert "\n" not in str(error.value)
 
 
@@ -376,9 +382,9 @@ def test_a_full_disk_leaves_the_checkpoint_before(surface, tmp_path, monkeypatch
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pl.Trainer, "save_checkpoint", full)
-        with pytest.raises(NsmError, match="No space left.*nsm resume=") as error:
+        with pytest.raises(NsmError) as error:
             run(surface, tmp_path / "full")
-    assert "\n" not in str(error.value) and "step 40" in str(error.value)
+    assert error.value.kind == "unwritable_file" and "\n" not in str(error.value)
     assert torch.load(tmp_path / "full" / "last.ckpt", weights_only=True)["global_step"] == 30
     assert not list((tmp_path / "full").glob("*.tmp"))
     run(surface, tmp_path / "whole")
@@ -387,15 +393,16 @@ def test_a_full_disk_leaves_the_checkpoint_before(surface, tmp_path, monkeypatch
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs limits of the system")
-def test_a_real_limit_on_what_can_be_written_is_told(surface, tmp_path):
+def test_a_real_limit_on_what_can_be_written(surface, tmp_path):
     """The system itself refuses: no file may pass 100 kB."""
     import resource
 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
-        with pytest.raises(NsmError, match=r"last\.ckpt: the checkpoint of step 10 cannot"):
+        with pytest.raises(NsmError) as error:
             run(surface, tmp_path, "map.width=256")
+        assert error.value.kind == "unwritable_file"
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.glob("*.tmp")) and not (tmp_path / "last.ckpt").exists()
@@ -423,7 +430,6 @@ def test_a_second_run_in_a_folder_is_refused_in_one_line(here, tmp_path):
         result = here("surface=hemisphere", "hydra.run.dir=run", *WORDS[:3])
         assert result.returncode == 2
         assert len(result.stderr.strip().splitlines()) == 1
-        assert "another run is at work" in result.stderr
         assert [p.name for p in (tmp_path / "run").iterdir()] == [".lock"]
     finally:
         holder.kill()
@@ -488,10 +494,11 @@ def test_gradients_of_parts_add_up_to_those_of_the_whole():
         assert (other - gradients[0]).abs().max() < 1e-14
 
 
-def test_where_nothing_fits_it_is_told_in_one_line(surface, tmp_path, monkeypatch):
+def test_where_nothing_fits_it_is_an_error(surface, tmp_path, monkeypatch):
     scarce(monkeypatch, SHORTAGES["torch"], fits=0)
-    with pytest.raises(NsmError, match=r"out of memory, even.*data\.batch_size"):
+    with pytest.raises(NsmError) as error:
         run(surface, tmp_path)
+    assert (error.value.kind, error.value.key) == ("out_of_memory", "data.batch_size")
 
 
 def test_other_errors_are_not_taken_for_a_shortage(surface, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from torch.multiprocessing.spawn import ProcessRaisedException
 
 from nsm.data.shard import Shard
 from nsm.errors import NsmError
-from nsm.pipeline.processes import told_by
+from nsm.pipeline.processes import raised_by
 
 # a process of its own: forking one that has run threads is not safe
 SCRIPT = """
@@ -21,7 +21,7 @@ import nsm
 
 folder = Path(sys.argv[1])
 short = ["trainer.max_steps=12", "data.steps_per_epoch=6", "data.held_out=256", "map.width=16",
-         "optimizer=sgd", "optimizer.lr=0.02", "artefacts=false", "logger=csv", "logger.every=3"]
+         "optimizer=sgd", "optimizer.lr=0.02", "artefacts=false", "logger=csv", "trainer.log_every=3"]
 surface = nsm.Surface.load("saddle", parameterization="tutte", cache=False)
 phis = [
     nsm.overfit(surface, folder=folder / f"overfit_{n}", progress=False,
@@ -74,10 +74,10 @@ def test_parts_are_equal_and_apart():
     assert torch.equal(Shard().of_rows(rows), rows)
 
 
-def test_bad_input_in_a_process_is_told_as_such():
+def test_bad_input_in_a_process_is_raised_as_such():
     text = "\n\n-- Process 1 terminated with the following error:\nTraceback ...\n{}\n"
     bad = ProcessRaisedException(text.format("nsm.errors.NsmError: mesh: no; do so"), 1, 123)
-    assert isinstance(told_by(bad), NsmError)
-    assert str(told_by(bad)) == "mesh: no; do so"
+    assert isinstance(raised_by(bad), NsmError)
+    assert str(raised_by(bad)) == "mesh: no; do so"
     defect = ProcessRaisedException(text.format("ValueError: nsm.errors.NsmError: no"), 1, 123)
-    assert told_by(defect) is defect
+    assert raised_by(defect) is defect

@@ -3,18 +3,21 @@
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
-from nsm.maps import build_map
 from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
-from nsm.pipeline import build_overfit
+from nsm.maps.networks import build_network
+from nsm.pipeline import built, make_task
 from nsm.results import pointwise_metrics
 from nsm.tasks.least_squares import _fit_tables, fit_linear_skip
+from nsm.tasks.planar import planar_map
 
-GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}
+GRID = {"_target_": "nsm.maps.encodings.SplineGrid", "resolutions": [4, 8], "features": 3}
+FOURIER = {"_target_": "nsm.maps.encodings.RandomFourierFeatures", "features": 4}
 MATRIX = np.array([[1.0, 0.3], [-0.2, 0.8], [0.5, 0.1]])
 
 
@@ -29,12 +32,25 @@ def sheet(height) -> Surface:
     return as_it_lies("sheet", vertices, faces, uv, "square")
 
 
-@pytest.mark.parametrize(
-    "encoding", [GRID, {"name": "fourier", "features": 4}, {"name": "identity"}]
-)
+def network_of(encoding):
+    return build_network(
+        map={"_target_": "nsm.maps.NeuralMap", "width": 8, "depth": 1, "linear_skip": "fitted"},
+        activation={"_target_": "nsm.maps.activations.Softplus"},
+        encoding=encoding,
+        out_dim=3,
+    )
+
+
+def overfit_module(surface, *words):
+    task = make_task(compose_config([*words]), Console())
+    task.use(surface)
+    return built(task)
+
+
+@pytest.mark.parametrize("encoding", [GRID, FOURIER, {"_target_": "nsm.maps.encodings.Identity"}])
 def test_a_plane_is_met_exactly(encoding):
     """Affine functions are in the span of every encoding."""
-    network = build_map({"width": 8, "depth": 1, "encoding": encoding, "linear_skip": "fitted"})
+    network = network_of(encoding)
     flat = sheet(lambda u, v: 0 * u + 2)
     fit_linear_skip(network, flat)
     uv = torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1
@@ -70,9 +86,7 @@ def test_a_curved_surface_is_met_before_any_training():
     wave = sheet(lambda u, v: 0.2 * np.sin(2 * u) * np.cos(v))
     words = ["domain=square", "encoding.resolutions=[8,32]", "seed=3"]
     fitted, plain = (
-        pointwise_metrics(
-            wave, build_overfit(compose_config([*words, f"map.linear_skip={r}"]), wave).map
-        )
+        pointwise_metrics(wave, overfit_module(wave, *words, f"map.linear_skip={r}").map)
         for r in ("fitted", "linear")
     )
     assert fitted["rms_percent"] < 0.02 < 5 < plain["rms_percent"]
@@ -89,20 +103,21 @@ def test_the_boundary_is_met_the_better_for_samples_on_it(monkeypatch):
     for every in (33, 10**9):
         monkeypatch.setattr("nsm.tasks.least_squares._BOUNDARY_EVERY", every)
         encoding = {**GRID, "resolutions": [8]}
-        network = build_map({"width": 8, "depth": 1, "encoding": encoding, "linear_skip": "fitted"})
+        network = network_of(encoding)
         fit_linear_skip(network, rough)
         with torch.no_grad():
             errors.append(float((network(uv) - wanted).square().sum(dim=1).mean().sqrt()))
     assert errors[0] < 0.95 * errors[1]
 
 
-def test_too_few_features_are_told():
-    config = compose_config(["map.linear_skip=fitted", "encoding.features=2", "domain=square"])
-    with pytest.raises(NsmError, match="needs 3 features"):
-        build_overfit(config, sheet(lambda u, v: 0 * u))
+def test_too_few_features_are_refused():
+    words = ["map.linear_skip=fitted", "encoding.features=2", "domain=square"]
+    with pytest.raises(NsmError):
+        overfit_module(sheet(lambda u, v: 0 * u), *words)
 
 
 def test_maps_of_the_plane_have_nothing_to_fit():
-    with pytest.raises(NsmError, match="map.linear_skip"):
-        compose_config(["task=param", "map.linear_skip=fitted"])
-    compose_config(["task=param", "map.linear_skip=linear"])
+    settings = compose_config(["task=param", "map.linear_skip=fitted"])
+    with pytest.raises(NsmError) as error:
+        planar_map(None, settings.map, settings.activation, settings.encoding)
+    assert error.value.key == "map.linear_skip"

@@ -1,4 +1,4 @@
-"""Optimisers and schedules from settings."""
+"""Optimizers and schedules from settings."""
 
 import copy
 import math
@@ -6,14 +6,33 @@ import math
 import pytest
 import torch
 
-from nsm.maps import build_map
-from nsm.tasks.optimizers import (
-    Shares,
-    build_optimizer,
-    build_scheduler,
-    in_one,
-    shared_options,
-)
+from nsm.errors import NsmError
+from nsm.maps.networks import build_network
+from nsm.tasks.joint_optimizer import Shares, in_one, shared_options
+from nsm.tasks.optimizers import build_optimizer
+from nsm.tasks.schedules import build_scheduler
+
+GRID = {"_target_": "nsm.maps.encodings.SplineGrid", "resolutions": [2, 4]}
+ADAM, MUON = "torch.optim.Adam", "nsm.tasks.optimizers.MuonBesideAdam"
+
+
+def network_of(depth=1, width=8, block="pre", **map):
+    return build_network(
+        map={
+            "_target_": "nsm.maps.NeuralMap",
+            "width": width,
+            "depth": depth,
+            "block": block,
+            **map,
+        },
+        activation={"_target_": "nsm.maps.activations.Softplus", "beta": 10.0},
+        encoding=GRID,
+        out_dim=3,
+    )
+
+
+def schedule(name, **settings):
+    return {"_target_": f"nsm.tasks.schedules.{name}", **settings}
 
 
 def rates(settings, max_steps, steps):
@@ -29,7 +48,7 @@ def rates(settings, max_steps, steps):
 
 
 def test_sgdr_restarts_with_growing_periods():
-    lr = rates({"name": "sgdr", "period": 10, "period_factor": 2.0}, 100, 40)
+    lr = rates(schedule("SGDR", period=10, period_factor=2.0), 100, 40)
     assert lr[0] == lr[10] == lr[30] == 1.0
     assert lr[5] == pytest.approx(0.5)
     assert lr[20] == pytest.approx(0.5)  # the middle of the second, longer period
@@ -37,7 +56,7 @@ def test_sgdr_restarts_with_growing_periods():
 
 
 def test_cosine_falls_to_its_final_share():
-    lr = rates({"name": "cosine", "final": 0.1}, 50, 51)
+    lr = rates(schedule("Cosine", final=0.1), 50, 51)
     assert lr[0] == 1.0
     assert lr[25] == pytest.approx(0.55)
     assert lr[50] == pytest.approx(0.1)
@@ -45,42 +64,68 @@ def test_cosine_falls_to_its_final_share():
 
 
 def test_warmup_rises_linearly():
-    lr = rates({"name": "constant", "warmup": 4}, 50, 8)
+    lr = rates(schedule("Constant", warmup=4), 50, 8)
     assert lr == pytest.approx([0.2, 0.4, 0.6, 0.8, 1, 1, 1, 1])
 
 
 def test_the_peak_is_a_share_of_the_rate():
-    full, low = (rates({"name": "cosine", "warmup": 4, **p}, 50, 20) for p in ({}, {"peak": 0.01}))
+    full, low = (rates(schedule("Cosine", warmup=4, **p), 50, 20) for p in ({}, {"peak": 0.01}))
     assert low == pytest.approx([0.01 * rate for rate in full])
 
 
 def test_feature_grids_take_their_own_rate():
-    network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
-    optimizer = build_optimizer(network, {"name": "adam", "lr": 1e-3, "encoding_lr": 1e-2})
+    network = network_of()
+    optimizer = build_optimizer(network, {"_target_": ADAM, "lr": 1e-3, "encoding_lr": 1e-2})
     by_rate = {g["lr"]: sum(p.numel() for p in g["params"]) for g in optimizer.param_groups}
     assert by_rate[1e-2] == sum(p.numel() for p in network.encoding.parameters())
     assert sum(by_rate.values()) == sum(p.numel() for p in network.parameters())
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("settings", "kind"),
     [
-        {"name": "adamm", "lr": 1e-3},
-        {"name": "adam", "lr": 1e-3, "momentumm": 0.9},
+        ({"_target_": "torch.optim.Adamm", "lr": 1e-3}, "not_importable"),
+        ({"_target_": ADAM, "lr": 1e-3, "momentumm": 0.9}, "not_instantiable"),
+        ({"_target_": ADAM, "lr": 1e-3, "encoding_lr": -1.0}, "out_of_range"),
     ],
 )
-def test_unknown_settings_are_refused(settings):
-    with pytest.raises(ValueError, match="optimizer"):
+def test_settings_of_no_optimizer_are_refused(settings, kind):
+    with pytest.raises(NsmError) as error:
         build_optimizer(torch.nn.Linear(2, 2), settings)
+    assert error.value.kind == kind
 
 
-def test_unknown_schedule_is_refused():
-    with pytest.raises(ValueError, match="scheduler 'cosin'"):
-        build_scheduler(torch.optim.SGD([torch.zeros(1)], lr=1.0), {"name": "cosin"}, 10)
+@pytest.mark.parametrize("target", ["NAdam", "RAdam", "Adagrad", "Adamax"])
+def test_any_optimizer_of_torch_works(target):
+    network = network_of()
+    settings = {"_target_": f"torch.optim.{target}", "lr": 1e-2, "encoding_lr": 3e-2}
+    optimizer = build_optimizer(network, settings)
+    assert [group["lr"] for group in optimizer.param_groups] == [1e-2, 3e-2]
+    with_gradients(optimizer, network, 1)
+
+
+def test_any_scheduler_of_torch_works():
+    lr = rates({"_target_": "torch.optim.lr_scheduler.StepLR", "step_size": 2, "gamma": 0.1}, 9, 4)
+    assert lr == pytest.approx([1, 1, 0.1, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        (schedule("SGDR", period_factor=0.5), "scheduler.period_factor"),
+        (schedule("SGDR", period=0), "scheduler.period"),
+        (schedule("Cosine", warmup=-1), "scheduler.warmup"),
+        (schedule("Constant", peak=float("nan")), "scheduler.peak"),
+    ],
+)
+def test_a_schedule_that_could_not_end_is_refused(settings, key):
+    with pytest.raises(NsmError) as error:
+        rates(settings, 10, 1)
+    assert (error.value.kind, error.value.key) == ("out_of_range", key)
 
 
 def test_cosine_is_half_a_wave():
-    lr = rates({"name": "cosine"}, 10, 10)
+    lr = rates(schedule("Cosine"), 10, 10)
     assert lr == pytest.approx([0.5 * (1 + math.cos(math.pi * k / 10)) for k in range(10)])
 
 
@@ -94,9 +139,8 @@ def with_gradients(optimizer, network, steps):
 
 def test_muon_takes_the_matrices_of_hidden_layers_and_adam_the_rest():
     torch.manual_seed(0)
-    shape = {"width": 8, "depth": 2, "linear_skip": "linear", "encoding": {"name": "spline_grid"}}
-    network = build_map(shape)
-    settings = {"name": "muon", "lr": 1e-3, "encoding_lr": 1e-2}
+    network = network_of(depth=2, linear_skip="linear")
+    settings = {"_target_": MUON, "lr": 1e-3, "encoding_lr": 1e-2}
     optimizer = build_optimizer(network, settings)
     assert [group["name"] for group in optimizer.param_groups] == [
         "matrices",
@@ -119,12 +163,12 @@ def test_muon_takes_the_matrices_of_hidden_layers_and_adam_the_rest():
 
 
 def test_muon_goes_on_from_its_state_as_if_never_stopped(tmp_path):
-    settings = {"name": "muon", "lr": 1e-2, "encoding_lr": 3e-2, "betas": [0.9, 0.99]}
-    plan = {"name": "cosine", "warmup": 2}
+    settings = {"_target_": MUON, "lr": 1e-2, "encoding_lr": 3e-2, "betas": [0.9, 0.99]}
+    plan = schedule("Cosine", warmup=2)
 
     def start():
         torch.manual_seed(0)
-        network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
+        network = network_of()
         optimizer = build_optimizer(network, settings)
         return network, optimizer, build_scheduler(optimizer, plan, 20)
 
@@ -147,13 +191,14 @@ def test_muon_goes_on_from_its_state_as_if_never_stopped(tmp_path):
 
 
 def test_muon_without_matrices_is_refused():
-    with pytest.raises(ValueError, match="no matrices"):
-        build_optimizer(torch.nn.LayerNorm(3), {"name": "muon", "lr": 1e-3})
+    with pytest.raises(NsmError) as error:
+        build_optimizer(torch.nn.LayerNorm(3), {"_target_": MUON, "lr": 1e-3})
+    assert error.value.key == "optimizer"
 
 
 def test_lbfgs_solves_a_quadratic_with_grids_and_network_as_one():
-    network = build_map({"width": 8, "depth": 1, "encoding": {"name": "spline_grid"}})
-    settings = {"name": "lbfgs", "lr": 1.0, "max_iter": 50, "line_search_fn": "strong_wolfe"}
+    network = network_of()
+    settings = {"_target_": "torch.optim.LBFGS", "max_iter": 50, "line_search_fn": "strong_wolfe"}
     optimizer = build_optimizer(network, settings)
     assert len(optimizer.param_groups) == 1
 
@@ -172,31 +217,31 @@ def assert_alike(state, other):
     torch.testing.assert_close(state["state"], other["state"])
 
 
-@pytest.mark.parametrize("name", ["adam", "adamw", "rmsprop", "sgd", "muon"])
-@pytest.mark.parametrize("apart", [False, True])
-def test_one_optimiser_makes_the_steps_of_several(name, apart):
-    settings = [{"name": name, "lr": 1e-2, "encoding_lr": 3e-2} for _ in range(3)]
+@pytest.mark.parametrize("name", ["Adam", "AdamW", "NAdam", "RMSprop", "SGD", "muon"])
+@pytest.mark.parametrize("own_rates", [False, True])
+def test_one_optimizer_makes_the_steps_of_several(name, own_rates):
+    target = MUON if name == "muon" else f"torch.optim.{name}"
+    settings = [{"_target_": target, "lr": 1e-2, "encoding_lr": 3e-2} for _ in range(3)]
     if name == "muon" and not hasattr(torch.optim, "Muon"):
         pytest.skip("torch is older than 2.9")
-    if apart:
+    if own_rates:
         settings[1]["lr"] = 2e-2
     common = [shared_options(one) for one in settings]
-    if apart and name == "muon":  # whose matrices are one group
+    if own_rates and name == "muon":  # whose matrices are one group
         assert common[0] != common[1]
         return
     assert common[0] == common[1] == common[2]
-    grid = {"name": "spline_grid", "resolutions": [2, 4]}
-    networks = [build_map({"width": 4, "depth": 2, "encoding": grid}) for _ in settings]
+    networks = [network_of(depth=2, width=4) for _ in settings]
     copies = copy.deepcopy(networks)
-    schedule = {"name": "cosine", "warmup": 3}
+    plan = schedule("Cosine", warmup=3)
 
     def scheduled(optimizer):
-        return optimizer, build_scheduler(optimizer, schedule, 10)
+        return optimizer, build_scheduler(optimizer, plan, 10)
 
     alone = [scheduled(build_optimizer(*both)) for both in zip(networks, settings, strict=True)]
     each = [scheduled(build_optimizer(*both))[0] for both in zip(copies, settings, strict=True)]
     joint, rates = scheduled(in_one(each))
-    assert len(joint.param_groups) == len(each[0].param_groups) * (3 if apart else 1)
+    assert len(joint.param_groups) == len(each[0].param_groups) * (3 if own_rates else 1)
     for _ in range(4):
         for network, copied in zip(networks, copies, strict=True):
             for p, q in zip(network.parameters(), copied.parameters(), strict=True):
@@ -219,4 +264,4 @@ def test_one_optimiser_makes_the_steps_of_several(name, apart):
 
 
 def test_steps_that_depend_on_all_weights_are_made_alone():
-    assert shared_options({"name": "lbfgs", "lr": 1.0}) is None
+    assert shared_options({"_target_": "torch.optim.LBFGS", "lr": 1.0}) is None

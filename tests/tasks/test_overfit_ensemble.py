@@ -12,7 +12,8 @@ from rich.console import Console
 
 import nsm
 from nsm.config import compose_config
-from nsm.pipeline.surface_cache import made_batched, made_once
+from nsm.pipeline import surface_cache
+from nsm.pipeline.surface_cache import cached_surfaces
 
 SMALL = [
     "experiment=quick",
@@ -33,20 +34,20 @@ def surfaces():
 def made(surfaces, words: list[str], *, together: bool) -> tuple[list[nsm.NeuralSurface], str]:
     config = compose_config(["task=pair_map", "seed=3"])
     config.phi.overrides = words
-    told = io.StringIO()
-    console = Console(file=told)
-    if together:
-        return made_batched(surfaces, config, console, in_one_batch=True), told.getvalue()
-    return [made_once(surface, config, console) for surface in surfaces], told.getvalue()
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:  # a GPU takes them in one batch
+        patch.setattr(surface_cache, "accelerator_of", lambda _: "gpu" if together else "cpu")
+        phis = cached_surfaces(surfaces, config, Console(file=printed))
+    return phis, printed.getvalue()
 
 
 def in_batches(cache: Path) -> list[int | None]:
     """How many were trained with each neural surface of a cache."""
     files = (cache / "neural").glob("*/metrics.json")
-    return [json.loads(file.read_text()).get("together") for file in files]
+    return [json.loads(file.read_text()).get("batched") for file in files]
 
 
-@pytest.mark.parametrize("words", [SMALL, [*SMALL, "energy.lambda_normal=0", "sampler=pool"]])
+@pytest.mark.parametrize("words", [SMALL, [*SMALL, "loss_weights.normal=0", "sampler=pool"]])
 def test_each_is_what_it_would_be_alone(surfaces, tmp_path, monkeypatch, words):
     monkeypatch.setenv("NSM_CACHE", str(tmp_path / "alone"))
     alone, _ = made(surfaces, words, together=False)

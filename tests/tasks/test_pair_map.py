@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from nsm.data import Samples
+from nsm.domains import Disc
+from nsm.energies import SymmetricDirichlet
 from nsm.maps import build_analytic
 from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks import CollectionMap, PairMap
 from nsm.tasks import fold_barrier as fold_barrier_module
+from nsm.tasks import terms as tasks_terms
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
 
@@ -15,22 +19,17 @@ SETTINGS = {
     "map": {
         "width": 16,
         "depth": 1,
-        "activation": {"name": "softplus", "beta": 10.0},
-        "encoding": {"name": "identity"},
     },
-    "optimizer": {"name": "adam", "lr": 3e-3},
-    "scheduler": {"name": "constant"},
+    "activation": {"_target_": "nsm.maps.activations.Softplus", "beta": 10.0},
+    "encoding": {"_target_": "nsm.maps.encodings.Identity"},
+    "optimizer": {"_target_": "torch.optim.Adam", "lr": 3e-3},
+    "scheduler": {"_target_": "nsm.tasks.schedules.Constant"},
     "max_steps": 200,
-    "domain": "disc",
-    "weights": {"symmetric_dirichlet": 1.0},
-    "constraints": {},
+    "domain": Disc(),
+    "energy": SymmetricDirichlet(),
 }
-HELD = {
-    "lambda_injectivity": 100.0,
-    "lambda_boundary": 1e3,
-    "lambda_landmarks": 10.0,
-    "lambda_seam": 0.0,
-    "lambda_triangles": 0.0,
+WEIGHTS = {"injectivity": 100.0, "boundary": 1e3, "landmarks": 10.0, "seam": 0.0, "triangles": 0.0}
+CONSTRAINTS = {
     "boundary": "exact",
     "landmarks": "augmented",
     "multiplier_every": 10,
@@ -42,10 +41,10 @@ MESH = (torch.as_tensor(_POINTS, dtype=torch.float32), torch.as_tensor(_FACES))
 
 
 def settings(changes):
-    """The settings with changes, whether of the constraints or of the rest."""
-    held = {**HELD, **{k: v for k, v in changes.items() if k in HELD}}
-    rest = {k: v for k, v in changes.items() if k not in HELD}
-    return {**SETTINGS, "constraints": held, **rest}
+    """The settings with changes: of the constraints, of the weights, or of the rest."""
+    constraints = {key: changes.pop(key, value) for key, value in CONSTRAINTS.items()}
+    weights = {**WEIGHTS, **changes.pop("weights", {})}
+    return {**SETTINGS, "loss_weights": weights, "constraints": constraints, **changes}
 
 
 def samples(n=256, seed=0):
@@ -54,14 +53,25 @@ def samples(n=256, seed=0):
     return torch.stack([r * t.cos(), r * t.sin()], dim=1)
 
 
-def pair(phi, psi, points=NONE, targets=NONE, turn=None, **changes):
+def quiet(kind):
+    """Made without a trainer: it logs nothing."""
+
+    def make(**arguments):
+        module = kind(**arguments)
+        module.log_every = 10**9
+        return module
+
+    return make
+
+
+def pair(phi, psi, points=NONE, targets=NONE, rotation=None, **changes):
     torch.manual_seed(0)
-    return PairMap(
+    return quiet(PairMap)(
         **settings(changes),
         points=points,
         targets=targets,
         seam=torch.zeros(0, 2, 2),
-        turn=torch.eye(2) if turn is None else turn,
+        rotation=torch.eye(2) if rotation is None else rotation,
         mesh=MESH,
         diagonal=1.0,
         phi=phi,
@@ -75,7 +85,6 @@ def surface(name, **parameters):
 
 def optimise(module, steps, every=10):
     """Plain optimisation without a trainer: the module's own steps."""
-    module.log = lambda *a, **k: None
     optimiser = torch.optim.Adam(module.map.parameters(), lr=3e-3)
     for step in range(steps):
         optimiser.zero_grad()
@@ -88,14 +97,20 @@ def optimise(module, steps, every=10):
     return module
 
 
-class Batch:
-    def __init__(self, uv):
-        self.uv = uv
+def Batch(uv):
+    return Samples(uv, torch.zeros(len(uv), 3), torch.zeros(len(uv), 3))
+
+
+def evaluated(module, x):
+    """Distortion, det J_h and h at points of Ω."""
+    batch = x if isinstance(module, CollectionMap) else Batch(x)
+    distortion, evaluation = module._evaluated(batch)
+    return distortion, evaluation.determinant, evaluation.image
 
 
 def test_the_identity_between_equal_surfaces_is_the_minimum():
     module = pair(surface("saddle"), surface("saddle"))
-    energy, determinant, image = module._distortion(samples())
+    energy, determinant, image = evaluated(module, samples())
     assert energy.mean.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
     assert (determinant == 1).all() and (image == samples()).all()
 
@@ -103,7 +118,7 @@ def test_the_identity_between_equal_surfaces_is_the_minimum():
 def test_an_isometry_between_different_surfaces_is_the_minimum():
     # a cylinder patch unrolls onto the plane without stretch
     module = pair(surface("cylinder"), surface("plane"))
-    energy, _, _ = module._distortion(samples())
+    energy, _, _ = evaluated(module, samples())
     assert energy.mean.item() == pytest.approx(2 + 2 / 1.01, rel=1e-4)
 
 
@@ -131,7 +146,7 @@ def test_optimisation_lowers_distortion_and_meets_landmarks():
     targets = torch.tensor([[0.25, 0.2], [-0.45, 0.1]])
     module = optimise(pair(surface("plane"), surface("sphere_cap"), points, targets), 250)
     assert (module(points) - targets).norm(dim=1).max() < 5e-3
-    energy, determinant, _ = module._distortion(samples(2000))
+    energy, determinant, _ = evaluated(module, samples(2000))
     assert energy.mean.item() < 4.5 and (determinant > 0).all()
 
 
@@ -145,7 +160,7 @@ def test_multipliers_meet_landmarks_better_than_a_fixed_weight():
             points,
             targets,
             landmarks=kind,
-            lambda_landmarks=10.0,
+            weights={"landmarks": 10.0},
         )
         off[kind] = (optimise(module, 800, every=25)(points) - targets).norm().item()
     assert off["augmented"] < 0.3 * off["fixed"]
@@ -160,7 +175,7 @@ def test_the_penalty_boundary_pulls_the_image_back():
         targets,
         boundary="penalty",
         landmarks="fixed",
-        lambda_boundary=0.0,
+        weights={"boundary": 0.0},
     )
     held = pair(
         surface("plane"),
@@ -169,16 +184,17 @@ def test_the_penalty_boundary_pulls_the_image_back():
         targets,
         boundary="penalty",
         landmarks="fixed",
-        lambda_boundary=1e3,
+        weights={"boundary": 1e3},
     )
-    images = [optimise(m, 150)(m.boundary_samples) for m in (loose, held)]
-    reach = [image.norm(dim=1).sub(1).abs().max().item() for image in images]
+    reach = [
+        optimise(m, 150)(m.boundary_samples).norm(dim=1).sub(1).abs().max().item()
+        for m in (loose, held)
+    ]
     assert reach[1] < 0.3 * reach[0]
 
 
 def test_samples_outside_leave_the_distortion_but_are_pulled():
     module = pair(surface("plane"), surface("plane"), boundary="penalty")
-    module.log = lambda *a, **k: None
     outside = Batch(1.5 * samples())
     loss = module.training_step(outside, 0)
     assert torch.isfinite(loss) and loss > 4
@@ -186,19 +202,19 @@ def test_samples_outside_leave_the_distortion_but_are_pulled():
 
 def test_the_ramp_moves_targets_from_the_start_to_their_place():
     module = pair(surface("plane"), surface("plane"), ramp=0.5)
-    assert module.ramped == 0.0
-    assert pair(surface("plane"), surface("plane")).ramped == 1.0
+    assert module.ramp == 0.0
+    assert pair(surface("plane"), surface("plane")).ramp == 1.0
 
 
 def test_the_seam_term_draws_both_copies_together():
     seam = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
     torch.manual_seed(0)
-    module = PairMap(
-        **settings({"lambda_seam": 10.0}),
+    module = quiet(PairMap)(
+        **settings({"weights": {"seam": 10.0}}),
         points=NONE,
         targets=NONE,
         seam=seam,
-        turn=torch.eye(2),
+        rotation=torch.eye(2),
         mesh=MESH,
         diagonal=1.0,
         phi=surface("plane"),
@@ -210,22 +226,22 @@ def test_the_seam_term_draws_both_copies_together():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"boundary": "soft"}, {"landmarks": "soft"}, {"ramp": 2.0}, {"weights": {"no": 1}}]
+    "changes", [{"boundary": "soft"}, {"landmarks": "soft"}, {"ramp": 2.0}, {"multiplier_every": 0}]
 )
 def test_settings_that_are_not_known_are_refused(changes):
     with pytest.raises(ValueError):
         pair(surface("plane"), surface("plane"), **changes)
 
 
-def collection(names, points=NONE, targets=None, **changes):
+def collection(names, points=NONE, targets=None, seam=None, **changes):
     torch.manual_seed(0)
     k = len(names)
-    return CollectionMap(
+    return quiet(CollectionMap)(
         **settings(changes),
         points=points,
         targets=torch.zeros(k, 0, 2) if targets is None else targets,
-        seam=torch.zeros(0, 2, 2),
-        turns=torch.eye(2).expand(k, 2, 2),
+        seam=torch.zeros(0, 2, 2) if seam is None else seam,
+        rotations=torch.eye(2).expand(k, 2, 2),
         mesh=MESH,
         diagonals=[1.0] * k,
         phis=[surface(n) for n in names],
@@ -233,7 +249,7 @@ def collection(names, points=NONE, targets=None, **changes):
 
 
 def test_a_collection_of_equal_surfaces_starts_at_the_minimum():
-    energy, determinant, _ = collection(["saddle"] * 3)._distortion(samples())
+    energy, determinant, _ = evaluated(collection(["saddle"] * 3), samples())
     assert energy.mean.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
     assert determinant.shape == (3, 256)
 
@@ -241,12 +257,11 @@ def test_a_collection_of_equal_surfaces_starts_at_the_minimum():
 def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
     module = collection(["plane", "sphere_cap"])
     x = samples(4096)
-    energy, _, _ = module._distortion(x)
-    forth, _, _ = pair(surface("plane"), surface("sphere_cap"))._distortion(x)
+    energy, _, _ = evaluated(module, x)
+    forth, _, _ = evaluated(pair(surface("plane"), surface("sphere_cap")), x)
     cap = surface("sphere_cap")
     area = torch.linalg.det((j := cap.value_and_jacobian(x)[1]).transpose(1, 2) @ j).sqrt()
     # samples are uniform on the plane: back counts by the cap's area
-    other = pair(cap, surface("plane"))
     with torch.no_grad():
         from nsm.energies import first_fundamental_form, symmetric_dirichlet
 
@@ -263,7 +278,6 @@ def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
     )
     assert forth.mean.item() == pytest.approx(forth_weighted.item(), rel=0.05)
     assert back.item() == pytest.approx(back_weighted.item(), rel=0.05)
-    assert other is not None
 
 
 def test_a_collection_meets_its_landmarks_on_every_surface():
@@ -325,8 +339,55 @@ def nearest(x):
 
 def test_a_collection_held_by_penalties_pulls_strays_back():
     module = collection(["plane", "saddle", "plane"], boundary="penalty")
-    module.log = lambda *a, **k: None
     assert torch.isfinite(module.training_step(1.5 * samples(), 0))
-    inner = module._distortion(samples())[0].mean
-    mixed = module._distortion(torch.cat([samples(), 2 + samples()]))[0].mean
+    inner = evaluated(module, samples())[0].mean
+    mixed = evaluated(module, torch.cat([samples(), 2 + samples()]))[0].mean
     assert mixed.item() == pytest.approx(inner.item(), rel=1e-5)
+
+
+def test_the_loss_of_a_collection_does_not_depend_on_how_many_surfaces_it_has():
+    """The same surface k times, each map off the identity, so that all terms have a part in it."""
+    points = torch.tensor([[0.2, 0.1]])
+    seam = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
+    gradients, losses = [], []
+    for k in (3, 4, 6):
+        module = collection(["saddle"] * k, points, torch.zeros(k, 1, 2), weights=FULL, seam=seam)
+        module.multipliers += 0.5
+        for h in module.map:
+            for parameter in h.parameters():
+                parameter.data = torch.full_like(parameter, 0.03)
+        loss = module.training_step(samples(), 0)
+        loss.backward()
+        # each surface's share of the gradient falls as 1/k
+        flat = [p.grad.flatten() for p in module.map[0].parameters()]
+        gradients.append(k * torch.cat(flat))
+        losses.append(loss.detach())
+    for gradient, loss in zip(gradients[1:], losses[1:], strict=True):
+        torch.testing.assert_close(loss, losses[0])
+        torch.testing.assert_close(gradient, gradients[0], rtol=1e-3, atol=1e-4)
+
+
+FULL = {"seam": 10.0, "triangles": 10.0}
+
+
+class Centre:
+    """A term of a user: the image is pulled to the middle of Ω."""
+
+    def __call__(self, evaluation):
+        return (evaluation.image**2).sum(dim=-1)
+
+
+@pytest.mark.parametrize("kind", ["pair", "collection"])
+def test_a_users_own_term_is_added_with_its_weight(kind, monkeypatch):
+    monkeypatch.setattr(tasks_terms, "made", lambda settings: Centre())
+    terms = {"centre": {"_target_": "mine.Centre", "weight": 0.5}}
+
+    def losses(**changes):
+        if kind == "pair":
+            module, x = pair(surface("plane"), surface("saddle"), **changes), Batch(samples())
+        else:
+            module, x = collection(["plane", "saddle", "cone"], **changes), samples()
+        return module.training_step(x, 0)
+
+    expected = 0.5 * (samples() ** 2).sum(dim=1).mean()
+    torch.testing.assert_close(losses(loss_terms=terms) - losses(), expected, rtol=1e-3, atol=1e-4)

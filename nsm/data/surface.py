@@ -1,7 +1,8 @@
-"""Training and held-out samples for overfitting one surface."""
+"""Training and held-out samples of one surface, or of several trained in one batch."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -9,12 +10,14 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader, IterableDataset
 
+from nsm.data.sampler import Draws, Sampler
 from nsm.data.sampling import Samples, SurfaceSampler
 from nsm.data.shard import Shard
 from nsm.domains import Surface
 
 # Held-out points come from their own stream, whatever the training's seed.
 HELD_OUT_SEED = 7_919
+HELD_OUT_BATCH = 8192
 
 
 class Steps(IterableDataset[Any]):
@@ -29,7 +32,7 @@ class Steps(IterableDataset[Any]):
     def following(
         cls, trainer: pl.Trainer | None, draw: Callable[[int], Any], length: int
     ) -> DataLoader[Any]:
-        """The next ``length`` batches of a trainer, wherever it stands when they are wanted."""
+        """The next ``length`` batches of a trainer, wherever it stands when they are drawn."""
         assert trainer is not None
         return DataLoader(cls(draw, lambda: trainer.global_step, length), batch_size=None)
 
@@ -42,18 +45,22 @@ class Steps(IterableDataset[Any]):
             yield self.draw(step)
 
 
-class OverfitData(pl.LightningDataModule):
+def ready(sampler: Draws, surface: SurfaceSampler, seed: int) -> Draws:
+    """A copy of a sampler for one surface, with its pool, if it keeps one, drawn."""
+    own = copy.copy(sampler)
+    if hasattr(own, "setup"):
+        own.setup(surface, seed)
+    return own
+
+
+class SurfaceData(pl.LightningDataModule):
     """Samples of a surface, drawn on the trainer's device.
 
     Args:
         surface: the prepared surface.
-        batch_size: points a step.
-        steps_per_epoch: steps between two looks at the held-out points.
-        vertex_share: share of a batch that are mesh vertices, in [0, 1].
-        domain_share: share of a batch that is uniform in Ω, not by area; 1 with the vertices' at
-            most. Errors are not weighted: it says how much each part of the surface counts.
-        pool: None to draw afresh each step; a number for a fixed set of so many points (all
-            vertices among them), as published, from which the batches are picked.
+        sampler: draws the training samples (see :class:`nsm.data.Sampler`).
+        batch_size: points in a step.
+        steps_per_epoch: steps between two evaluations of the held-out points.
         held_out: points on which the error is followed; never trained on.
         seed: of the training samples.
     """
@@ -61,84 +68,72 @@ class OverfitData(pl.LightningDataModule):
     def __init__(
         self,
         surface: Surface,
+        sampler: Draws | None = None,
         *,
         batch_size: int = 4096,
         steps_per_epoch: int = 250,
-        vertex_share: float = 0.1,
-        domain_share: float = 0.0,
-        pool: int | None = None,
         held_out: int = 16_384,
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.surface = surface
+        self.surface, self.sampler = surface, sampler or Sampler()
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
-        self.vertex_share, self.domain_share, self.pool_size = vertex_share, domain_share, pool
         self.held_out, self.seed = held_out, seed
         self.part = Shard()
 
     def setup(self, stage: str | None = None) -> None:
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         self.part = Shard.of(self.trainer)
-        self.sampler = SurfaceSampler(self.surface, device)
-        self.pool = (
-            self.sampler.pool(self.pool_size, self.sampler.generator(self.seed, -1))
-            if self.pool_size
-            else None
-        )
+        self.points = SurfaceSampler(self.surface, device)
+        self.own_sampler = ready(self.sampler, self.points, self.seed)
 
     def batch(self, step: int) -> Samples:
-        """The training samples of a step; of several processes, this one's part of them."""
-        return Samples(*(self.part.of_rows(rows) for rows in self._whole(step)))
-
-    def _whole(self, step: int) -> Samples:
-        generator = self.sampler.generator(self.seed, step)
-        if self.pool is None:
-            shares = {"vertex_share": self.vertex_share, "domain_share": self.domain_share}
-            return self.sampler.draw(self.batch_size, generator=generator, **shares)
-        index = torch.randint(
-            len(self.pool.uv),
-            (self.batch_size,),
-            generator=generator,
-            device=self.sampler.device,
-        )
-        return Samples(*(part[index] for part in self.pool))
+        """The training samples of a step; of several processes, this one's share of them."""
+        generator = self.points.generator(self.seed, step)
+        whole = self.own_sampler.draw(self.points, self.batch_size, generator)
+        return Samples(*(self.part.of_rows(rows) for rows in whole))
 
     def train_dataloader(self) -> DataLoader[Samples]:
         return Steps.following(self.trainer, self.batch, self.steps_per_epoch)
 
     def held_out_batches(self) -> list[Samples]:
-        """The held-out samples, so many at once as are evaluated together."""
-        samples = self.sampler.by_area(self.held_out, self.sampler.generator(HELD_OUT_SEED))
-        return [Samples(*parts) for parts in zip(*(p.split(8192) for p in samples), strict=True)]
+        """The held-out samples, in batches that are evaluated at once."""
+        samples = self.points.by_area(self.held_out, self.points.generator(HELD_OUT_SEED))
+        parts = zip(*(p.split(HELD_OUT_BATCH) for p in samples), strict=True)
+        return [Samples(*part) for part in parts]
 
     def val_dataloader(self) -> DataLoader[Samples]:
         return DataLoader(self.held_out_batches(), batch_size=None)  # type: ignore[arg-type]
 
 
 class EnsembleData(pl.LightningDataModule):
-    """The samples that :class:`OverfitData` has of each of k surfaces: Samples of (k, N, ...).
+    """The samples that :class:`SurfaceData` has of each of k surfaces: Samples of (k, N, ...).
 
     Args:
         surfaces: the prepared surfaces; one may be there more than once.
+        sampler: as for :class:`SurfaceData`.
         seeds: of the training samples, one for each. What is the same is drawn once.
-        **settings: as for :class:`OverfitData`, with the steps between two looks at the held-out
-            points.
+        steps_per_epoch: steps between two evaluations of the held-out points.
+        **settings: as for :class:`SurfaceData`.
     """
 
     def __init__(
         self,
         surfaces: Sequence[Surface],
+        sampler: Draws,
         seeds: Sequence[int],
         *,
         steps_per_epoch: int,
         **settings: Any,
     ) -> None:
         super().__init__()
-        asked = list(zip(map(id, surfaces), seeds, strict=True))
-        known = dict(zip(asked, surfaces, strict=True))
-        self.parts = [OverfitData(known[one], seed=one[1], **settings) for one in known]
-        self.order = [list(known).index(one) for one in asked]
+        keys = list(zip(map(id, surfaces), seeds, strict=True))
+        distinct = dict(zip(keys, surfaces, strict=True))
+        self.parts = [
+            SurfaceData(surface, sampler, seed=seed, **settings)
+            for (_, seed), surface in distinct.items()
+        ]
+        self.order = [list(distinct).index(key) for key in keys]
         self.steps_per_epoch = steps_per_epoch
 
     def setup(self, stage: str | None = None) -> None:

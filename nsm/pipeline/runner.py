@@ -1,0 +1,178 @@
+"""One runner for all tasks: prepare, train, certify, measure, save."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+from omegaconf import DictConfig
+from rich.console import Console
+
+from nsm.errors import NsmError
+from nsm.instantiation import made
+from nsm.pipeline.certification import certified
+from nsm.pipeline.folder_lock import folder_lock
+from nsm.pipeline.process_state import process_state
+from nsm.pipeline.task import Given, Task
+from nsm.pipeline.training import Run, stored_config, trained
+from nsm.results import atomic_write
+from nsm.results.callbacks import Pictures
+from nsm.results.divergence_guard import guard_of
+from nsm.results.files import as_json
+from nsm.results.loggers import check_packages, log_figures, loggers_of
+from nsm.run_directories import is_passing
+from nsm.tasks.ensemble import Ensemble
+
+
+def run(config: DictConfig, folder: Path) -> None:
+    """Run the task of a configuration in a folder, where no other run may be at work.
+
+    With ``resume`` set, the folder's own configuration takes its place, and the training goes on
+    from its checkpoint.
+
+    Raises:
+        NsmError: bad input of any kind, or another process at work in the folder.
+    """
+    with folder_lock(folder):
+        resuming = config.resume is not None
+        if resuming:
+            config = stored_config(folder, config.trust)
+        run_task(config, folder, resuming=resuming)
+
+
+def run_task(
+    config: DictConfig,
+    folder: Path,
+    given: Given | None = None,
+    *,
+    resuming: bool = False,
+) -> Any:
+    """Run the task that ``config.task`` names, and leave all results in the folder.
+
+    The caller's process (random states, threads, environment, ...) stays as it was.
+
+    Args:
+        config: as :func:`nsm.config.compose_config` gives it.
+        folder: the run folder, which the caller holds.
+        given: inputs, instead of those that the configuration names.
+        resuming: go on from the folder's checkpoint.
+
+    Returns:
+        The task's result.
+
+    Raises:
+        NsmError: an input, setting or run folder that cannot be used.
+    """
+    started = time.monotonic()
+    with process_state():
+        task = make_task(config, Console(highlight=False, markup=False))
+        check_packages(config.logger)
+        task.prepare(given or Given())
+        return run_prepared(task, Run(config, folder, resuming), started)
+
+
+def make_task(config: DictConfig, console: Console) -> Task:
+    """The task that ``config.task`` names, not yet prepared.
+
+    Raises:
+        NsmError: it names no task.
+    """
+    task = made(config.task)
+    if not isinstance(task, Task):
+        raise NsmError(
+            f"setting task._target_: a {type(task).__name__} is no nsm.pipeline.Task",
+            kind="wrong_type",
+            key="task._target_",
+        )
+    task.setup(config, console)
+    return task
+
+
+def run_prepared(task: Task, run: Run, started: float) -> Any:
+    """Train and finish a prepared task.
+
+    Args:
+        task: with its inputs.
+        run: of the task.
+        started: when the run began, by ``time.monotonic``.
+    """
+    module, data = built(task), task.build_data()
+    trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
+    return finish(task, run, module, trainer, started, data=data)
+
+
+def built(task: Task) -> Any:
+    """The task's module, made with the random state of the seed.
+
+    Raises:
+        NsmError: settings that do not fit together.
+    """
+    pl.seed_everything(task.config.seed, verbose=False)
+    try:
+        module = task.build()
+        module.configure_optimizers()  # settings that do not fit fail before any work
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise NsmError(
+            f"setting: {' '.join(str(error).split())}", kind="not_instantiable"
+        ) from error
+    return module
+
+
+def pictures_of(task: Task) -> Pictures:
+    """The task's pictures over the training."""
+    return Pictures(task.picture_name, task.picture, task.config.trainer.log_pictures)
+
+
+def finish(
+    task: Task,
+    run: Run,
+    module: Any,
+    trainer: pl.Trainer,
+    started: float,
+    *,
+    data: pl.LightningDataModule | None = None,
+    index: int = 0,
+) -> Any:
+    """Certify, measure and save the result of a training.
+
+    metrics.json is written last: its presence says that the run is complete.
+
+    Args:
+        task, run, module, started: as for :func:`run_prepared`.
+        trainer: that has trained it, or several in one batch, of which it is number ``index``.
+        data: that it was trained on, for further trainings.
+        index: see ``trainer``.
+    """
+    figures: dict[str, Any] = {}
+    if task.certified:
+        assert data is not None
+        result, figures = certified(task, module, data)
+    else:
+        result = task.make_result(module)
+    task.measure(result)
+    task.save(run.folder, result)
+    if task.config.artefacts:
+        task.write_artefacts(run.folder, result)
+    ensemble = trainer.lightning_module
+    if isinstance(ensemble, Ensemble):
+        figures["batched"] = len(ensemble.each)
+    loggers = loggers_of(trainer.loggers, index)
+    log_figures(loggers, task.settings, result.metrics, trainer.global_step)
+    words = {
+        "surface": task.surface.name,
+        "steps": trainer.global_step,
+        "seconds": round(time.monotonic() - started, 2),
+        "preparation": task.surface.quality,
+        "faults": guard_of(trainer),
+        **task.figures(result),
+        **figures,
+        "metrics": result.metrics,
+    }
+    atomic_write(run.folder / "metrics.json", as_json(words))
+    if task.table is not None:
+        task.console.print(task.table(result.metrics))
+    if not is_passing(run.folder):
+        task.console.print(f"results in {run.folder}", soft_wrap=True)
+    return result

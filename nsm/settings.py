@@ -1,0 +1,427 @@
+"""The settings that are no group: names, types and defaults, with the help on each in Args.
+
+``nsm --help``, the reference page, the command line's check and the defaults of a run are made
+from these classes. Choices (activation, optimizer, ...) are no part of them: an option there is a
+file of ``conf/`` with ``_target_``, and the signature and docstring of what it names say the rest.
+"""
+
+from __future__ import annotations
+
+import inspect
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Annotated, Any, Literal, Union
+
+
+@dataclass(frozen=True)
+class Range:
+    """The least and the largest value that a setting may have."""
+
+    least: float
+    largest: float = float("inf")
+
+
+Count = Annotated[int, Range(1)]
+Whole = Annotated[int, Range(0)]
+Weight = Annotated[float, Range(0)]
+Share = Annotated[float, Range(0, 1)]
+
+
+class Misfit(ValueError):
+    """A value that does not fit its type.
+
+    Args:
+        message: what is wrong.
+        kind: ``wrong_type``, ``out_of_range`` or ``unknown_option``.
+    """
+
+    def __init__(self, message: str, kind: str = "wrong_type") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def fit(value: Any, kind: Any) -> Any:
+    """A value from YAML, the command line or Python as one of an annotated type.
+
+    Whole numbers become floats, and numbers names, where the type says so. A mapping fits classes
+    that YAML cannot write down, since ``_target_`` in it makes an object.
+
+    Raises:
+        Misfit: it does not fit.
+    """
+    origin, inside = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        value = fit(value, inside[0])
+        limits = inside[1]
+        if value is not None and not limits.least <= value <= limits.largest:
+            bounds = f"at least {limits.least}"
+            if limits.largest < float("inf"):
+                bounds += f" and at most {limits.largest}"
+            raise Misfit(f"{value} must be {bounds}", "out_of_range")
+        return value
+    if origin in (Union, types.UnionType):
+        misfits = []
+        for one in inside:
+            try:
+                return fit(value, one)
+            except Misfit as misfit:
+                misfits.append(misfit)
+        ranges = [misfit for misfit in misfits if misfit.kind != "wrong_type"]
+        raise ranges[0] if ranges else Misfit(f"{value!r} is not {described(kind)}")
+    if origin is Literal:
+        if value not in inside:
+            raise Misfit(f"{value!r} is not one of {', '.join(map(str, inside))}", "unknown_option")
+        return value
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if kind is float and number:
+        return float(value)
+    if kind is str and number:
+        return str(value)
+    if origin in (list, tuple, Sequence) and isinstance(value, (list, tuple)):
+        return [fit(item, inside[0]) for item in value] if inside else list(value)
+    if origin in (dict, Mapping) and isinstance(value, Mapping):
+        return dict(value)
+    if kind in _PLAIN or kind is type(None):
+        fits = type(value) is kind
+    elif inspect.isclass(kind) and not isinstance(value, Mapping):  # a mapping has a _target_
+        try:
+            fits = isinstance(value, kind)
+        except TypeError:
+            fits = True
+    else:
+        fits = True
+    if fits:
+        return value
+    raise Misfit(f"{value!r} is not {described(kind)}")
+
+
+_PLAIN = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    list: "a list",
+    dict: "a mapping",
+}
+
+
+def described(kind: Any) -> str:
+    """A type as users know it, without the classes that YAML cannot write down."""
+    none = type(None)
+    origin, inside = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        return described(inside[0])
+    if origin in (Union, types.UnionType):
+        known = [one for one in inside if not inspect.isclass(one) or one in _PLAIN or one is none]
+        return " or ".join(dict.fromkeys(described(one) for one in known or inside))
+    if origin is Literal:
+        return f"one of {', '.join(map(str, inside))}"
+    if origin in (list, tuple, Sequence):
+        return f"a list, each item {described(inside[0])}" if inside else "a list"
+    if kind is none:
+        return "null"
+    return _PLAIN.get(origin or kind, getattr(kind, "__name__", str(kind)))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a class or function.
+
+    Attributes:
+        kind: its annotated type.
+        default: its default, unless it is required.
+        remark: what it is; empty: the docstring says it.
+    """
+
+    kind: Any
+    default: Any = inspect.Parameter.empty
+    remark: str = ""
+
+    @property
+    def required(self) -> bool:
+        return self.default is inspect.Parameter.empty
+
+
+def parameters(thing: Callable[..., Any]) -> tuple[dict[str, Parameter], bool]:
+    """The parameters of a class or function by name, and whether it accepts any others.
+
+    One without a signature, as some written in C are, accepts any.
+    """
+    try:
+        signature = inspect.signature(thing)
+    except (ValueError, TypeError):
+        return {}, True
+    try:
+        function = thing.__init__ if inspect.isclass(thing) else thing  # type: ignore[misc]
+        hints = typing.get_type_hints(function, include_extras=True)
+    except (NameError, TypeError, AttributeError):  # annotations that cannot be resolved
+        hints = {}
+    known, others = {}, False
+    for name, parameter in signature.parameters.items():
+        if parameter.kind is parameter.VAR_KEYWORD:
+            others = True
+        elif parameter.kind is not parameter.VAR_POSITIONAL:
+            default = parameter.default
+            if type(default).__name__ == "_HAS_DEFAULT_FACTORY_CLASS":
+                default = next(f for f in fields(thing) if f.name == name).default_factory()
+            known[name] = Parameter(hints.get(name, Any), default)
+    return known, others
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Base of settings that the tasks use: values that do not fit raise ValueError."""
+
+    def __post_init__(self) -> None:
+        for name, parameter in parameters(type(self))[0].items():
+            try:
+                object.__setattr__(self, name, fit(getattr(self, name), parameter.kind))
+            except Misfit as misfit:
+                raise Misfit(f"{name}: {misfit}", misfit.kind) from None
+
+
+# of matrix products in a training: our name, and torch's
+PRECISIONS = {"float32": "highest", "tf32": "high", "bf16": "medium"}
+
+
+@dataclass
+class SurfaceSettings:
+    """The mesh.
+
+    Args:
+        path: your mesh file; it takes precedence over the name. ``surface=FILE`` sets it, and so
+            does ``nsm FILE``.
+        name: a mesh of the catalogue.
+        seam_vertices: vertices, by their numbers in the file, that the cut passes through; null:
+            chosen.
+        parameterization: of the mesh over Ω: slim (low distortion) or tutte.
+        cache: keep the prepared surface on disk, under a hash of its content.
+    """
+
+    path: str | None = None
+    name: str = "terrain"
+    seam_vertices: list[int] | None = None
+    parameterization: Literal["slim", "tutte"] = "slim"
+    cache: bool = True
+
+
+@dataclass
+class PhiSettings:
+    """The neural surface that a map starts from.
+
+    Args:
+        path: for task=param, the run folder of a neural surface; null: one is trained.
+        overrides: for maps, settings of the trainings of their neural surfaces, as in
+            'phi.overrides=["map=residual","seed=1"]'.
+    """
+
+    path: str | None = None
+    overrides: list[str] = field(default_factory=list)
+
+
+@dataclass
+class AttributesSettings:
+    """Values at the vertices that a map transfers.
+
+    Args:
+        source: a .npy array with a row for each vertex of the source's mesh file.
+        target: the same of the target, transferred to the source.
+    """
+
+    source: str | None = None
+    target: str | None = None
+
+
+@dataclass
+class SeamSettings:
+    """How closed meshes with landmarks are cut jointly.
+
+    Args:
+        path: shortest or hidden paths; auto: the ones for which the domains agree best.
+        landmarks: how many landmarks the cut passes through, mutually distant ones; null: the
+            number for which the domains agree best.
+    """
+
+    path: Literal["auto", "shortest", "hidden"] = "auto"
+    landmarks: Whole | None = None
+
+
+@dataclass
+class CertificationSettings:
+    """What happens to a map that is not certified to be injective.
+
+    At the end every triangle and the order of the boundary are verified; metrics.json has the
+    result.
+
+    Args:
+        repair: move the vertices around flipped triangles.
+        rounds: where that is not enough, so many further trainings of a tenth of the steps, with
+            stronger terms.
+    """
+
+    repair: bool = True
+    rounds: Whole = 2
+
+
+@dataclass
+class TrainerSettings:
+    """Length, hardware and stopping rule of the training, and what it records.
+
+    Args:
+        max_steps: steps of the optimizer.
+        accelerator: auto, cpu or gpu.
+        devices: processes that share each step, each with its part of the batch on its own CPU
+            core or GPU.
+        stop_gradient_norm: stop when the norm of the gradient, averaged over ``stop_window``
+            steps, falls below this; null: never.
+        stop_window: steps over which the norm is averaged.
+        threads: of the CPU; the default networks are so small that one is fastest. null: what
+            torch chooses, for large networks.
+        precision: of matrix products: float32; or tf32 or bf16, faster and less exact, where the
+            hardware has them.
+        compile: compile the evaluation of the networks: half a minute at the start, then faster
+            steps; without a compiler nothing changes.
+        progress: show a progress bar.
+        gradient_clip: largest norm of a step's gradient; null: no limit.
+        log_every: steps between two values in the logs.
+        log_pictures: pictures of the surface or map in the logs.
+    """
+
+    max_steps: Count = 8000
+    accelerator: Literal["auto", "cpu", "gpu"] = "auto"
+    devices: Count = 1
+    stop_gradient_norm: Weight | None = None
+    stop_window: Count = 100
+    threads: Count | None = 1
+    precision: Literal["float32", "tf32", "bf16"] = "float32"
+    compile: bool = False
+    progress: bool = True
+    gradient_clip: Weight | None = None
+    log_every: Count = 25
+    log_pictures: Whole = 6
+
+
+@dataclass(frozen=True)
+class OverfitWeights(Checked):
+    """Weights of the terms of task=overfit.
+
+    Args:
+        normal: λ_n, of the mean squared difference of unit normals.
+    """
+
+    normal: Weight
+
+
+@dataclass(frozen=True)
+class ParamWeights(Checked):
+    """Weights of the terms of task=param.
+
+    Args:
+        injectivity: λ_inv, against folds at the samples.
+        triangles: against folds of the mesh triangles nearest to folding.
+    """
+
+    injectivity: Weight
+    triangles: Weight
+
+
+@dataclass(frozen=True)
+class PairWeights(ParamWeights):
+    """Weights of the terms of task=pair_map and task=collection_map.
+
+    Args:
+        injectivity: λ_inv, against folds at the samples.
+        triangles: against folds of the mesh triangles nearest to folding.
+        boundary: λ_B, with constraints.boundary=penalty: of points of ∂Ω that leave it.
+        landmarks: λ_C, of landmarks that miss their targets.
+        seam: of the gap between the images of the two sides of the source's seam.
+    """
+
+    boundary: Weight
+    landmarks: Weight
+    seam: Weight
+
+
+@dataclass(frozen=True)
+class ParamConstraints(Checked):
+    """How task=param constrains its map.
+
+    Args:
+        boundary: free; or fixed: h keeps to the domain by construction and its boundary slides,
+            so that the map is bijective.
+    """
+
+    boundary: Literal["free", "fixed"]
+
+
+@dataclass(frozen=True)
+class PairConstraints(Checked):
+    """How task=pair_map and task=collection_map constrain their maps.
+
+    Args:
+        boundary: exact: h keeps to the domain by construction; penalty: λ_B pulls the image of
+            the boundary to ∂Ω.
+        landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
+        multiplier_every: steps between two updates of the multipliers.
+        ramp: share of the steps over which the weights of landmarks and seam rise to their values.
+        fold_margin: what the determinant of J_h must stay above at the mesh triangles.
+    """
+
+    boundary: Literal["exact", "penalty"]
+    landmarks: Literal["augmented", "fixed"]
+    ramp: Share
+    multiplier_every: Count = 50
+    fold_margin: Share = 0.1
+
+
+@dataclass
+class Settings:
+    """The settings of a run outside the groups.
+
+    Args:
+        source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface.
+        target: the same; or an analytic surface: a name (sphere_cap, plane, ...) or
+            '{name: graph, z: 0.3*u*v}'.
+        surfaces: of task=collection_map: three surfaces or more, each as source.
+        landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned or .json, one for
+            each surface; or pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z] stands for
+            the vertex nearest to it.
+        loss_terms: your own terms: +loss_terms.mine._target_=mypackage.MyTerm
+            +loss_terms.mine.weight=0.1.
+        callbacks: Lightning callbacks: +callbacks.mine._target_=mypackage.MyCallback.
+        trust: modules of which classes named in files of earlier runs may be used:
+            trust=[mypackage].
+        seed: of the initial network and the samples: the same seed gives the same result.
+        artefacts: leave pictures and exported meshes in the run folder.
+        resume: the folder of an interrupted run, which goes on.
+    """
+
+    surface: SurfaceSettings = field(default_factory=SurfaceSettings)
+    phi: PhiSettings = field(default_factory=PhiSettings)
+    source: str | dict[str, Any] | None = None
+    target: str | dict[str, Any] | None = None
+    surfaces: list[Any] | None = None
+    landmarks: str | list[Any] | dict[str, Any] | None = None
+    attributes: AttributesSettings = field(default_factory=AttributesSettings)
+    seam: SeamSettings = field(default_factory=SeamSettings)
+    certification: CertificationSettings = field(default_factory=CertificationSettings)
+    trainer: TrainerSettings = field(default_factory=TrainerSettings)
+    loss_terms: dict[str, Any] = field(default_factory=dict)
+    callbacks: dict[str, Any] = field(default_factory=dict)
+    trust: list[str] = field(default_factory=list)
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0  # the largest that numpy takes
+    artefacts: bool = True
+    resume: str | None = None
+
+
+def defaults() -> dict[str, Any]:
+    """The defaults of all plain settings, as dictionaries."""
+    return asdict(Settings())
+
+
+def parts() -> dict[str, type]:
+    """The classes of the nested plain settings by key: surface, phi, trainer, ..."""
+    kinds = {key: parameter.kind for key, parameter in parameters(Settings)[0].items()}
+    return {key: kind for key, kind in kinds.items() if is_dataclass(kind)}

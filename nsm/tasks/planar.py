@@ -1,0 +1,33 @@
+"""The planar map h that a task trains, from plain settings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nsm.errors import NsmError
+from nsm.maps import PlanarMap
+from nsm.maps.networks import build_network
+
+
+def planar_map(
+    domain: Any, map: dict[str, Any], activation: dict[str, Any], encoding: dict[str, Any]
+) -> Any:
+    """h: Ω → R², the identity before its training.
+
+    Args:
+        domain: h maps it to itself, by construction; None: h is unconstrained.
+        map, activation, encoding: settings of h's network.
+
+    Raises:
+        NsmError: a linear skip that is to be fitted to a surface.
+    """
+    if map.get("linear_skip") == "fitted":
+        raise NsmError(
+            "setting map.linear_skip: a planar map has no surface to fit; "
+            "take initialization=random",
+            kind="unknown_option",
+            key="map.linear_skip",
+        )
+    out_dim = 2 if domain is None else domain.network_out_dim
+    network = build_network(map=map, activation=activation, encoding=encoding, out_dim=out_dim)
+    return PlanarMap(network) if domain is None else domain.equivariant(network)

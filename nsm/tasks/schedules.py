@@ -1,0 +1,145 @@
+"""Learning-rate schedules, stepped after each training step.
+
+Each is a share of the optimizer's rates: ``peak`` times a linear rise over the first ``warmup``
+steps times the schedule's own course. Any scheduler of torch does as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
+
+from nsm.errors import NsmError
+from nsm.instantiation import made_with
+
+Course = Callable[[float], float]  # of the step: share of the full rate
+
+
+class Constant(LambdaLR):
+    """The full rate from the first step to the last.
+
+    Args:
+        optimizer: whose rates are scheduled.
+        warmup: steps of linear rise at the start.
+        peak: share of the optimizer's rates that is the full rate.
+
+    Raises:
+        NsmError: a negative number.
+    """
+
+    def __init__(self, optimizer: Optimizer, warmup: int = 0, peak: float = 1.0) -> None:
+        super().__init__(optimizer, _share(lambda step: 1.0, warmup, peak))
+
+
+class Cosine(LambdaLR):
+    """One half-wave from the full rate to ``final`` of it at the last step.
+
+    Args:
+        optimizer: whose rates are scheduled.
+        max_steps: length of the training.
+        warmup: steps of linear rise at the start.
+        final: share of the full rate at the last step.
+        peak: share of the optimizer's rates that is the full rate.
+
+    Raises:
+        NsmError: a negative number.
+    """
+
+    def __init__(
+        self,
+        optimizer: Optimizer,
+        max_steps: int,
+        warmup: int = 0,
+        final: float = 0.0,
+        peak: float = 1.0,
+    ) -> None:
+        _check(final=final)
+
+        def course(step: float) -> float:
+            return _wave(min(1.0, step / max(1, max_steps)), final)
+
+        super().__init__(optimizer, _share(course, warmup, peak))
+
+
+class SGDR(LambdaLR):
+    """Warm restarts: half-waves from the full rate to ``final`` of it (Loshchilov and Hutter,
+    ICLR 2017).
+
+    Args:
+        optimizer: whose rates are scheduled.
+        period: steps of the first wave.
+        period_factor: length of each wave relative to the one before, at least 1.
+        final: share of the full rate at the end of a wave.
+        warmup: steps of linear rise at the start.
+        peak: share of the optimizer's rates that is the full rate.
+
+    Raises:
+        NsmError: a negative number, a period of zero, or a factor below 1.
+    """
+
+    def __init__(
+        self,
+        optimizer: Optimizer,
+        period: float = 1000,
+        period_factor: float = 2.0,
+        final: float = 0.0,
+        warmup: int = 0,
+        peak: float = 1.0,
+    ) -> None:
+        _check(final=final)
+        if not period > 0:
+            raise _out_of_range("period", f"{period} is not above 0")
+        if not period_factor >= 1:  # waves that shrink would end before the training does
+            raise _out_of_range("period_factor", f"{period_factor} is not at least 1")
+
+        def course(step: float) -> float:
+            length = float(period)
+            while step >= length:
+                step -= length
+                length *= period_factor
+            return _wave(step / length, final)
+
+        super().__init__(optimizer, _share(course, warmup, peak))
+
+
+def _wave(share: float, final: float) -> float:
+    return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+def _share(course: Course, warmup: int, peak: float) -> Course:
+    _check(warmup=warmup, peak=peak)
+    return lambda step: peak * min(1.0, (step + 1) / (warmup + 1)) * course(step)
+
+
+def _check(**settings: float) -> None:
+    for key, value in settings.items():
+        if not value >= 0:
+            raise _out_of_range(key, f"{value} is negative")
+
+
+def _out_of_range(key: str, reason: str) -> NsmError:
+    key = f"scheduler.{key}"
+    return NsmError(f"setting {key}: {reason}", kind="out_of_range", key=key)
+
+
+def build_scheduler(
+    optimizer: Optimizer, settings: Mapping[str, Any], max_steps: int
+) -> LRScheduler:
+    """The schedule of a training, made with the optimizer and, if it takes it, ``max_steps``.
+
+    Raises:
+        NsmError: it cannot be made of its settings.
+    """
+    scheduler: LRScheduler = made_with(settings, optimizer=optimizer, max_steps=max_steps)
+    return scheduler
+
+
+def scheduled(optimizer: Optimizer, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """An optimizer with the schedule of a task's hyperparameters, as Lightning expects them."""
+    scheduler = build_scheduler(optimizer, settings["scheduler"], settings["max_steps"])
+    every_step = {"scheduler": scheduler, "interval": "step", "name": "learning_rate"}
+    return {"optimizer": optimizer, "lr_scheduler": every_step}
