@@ -1,4 +1,4 @@
-"""Shapes as GLB, as the browser draws them."""
+"""Shapes as GLB, for the browser."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from nsm.results.view.scene import Paint, Shape
 
 
 def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
-    """A shape with its vertices at (V, 3), smooth, seen from both sides, in its colours."""
+    """A shape with its vertices at (V, 3), painted, double-sided and with smooth normals."""
     colours = np.ones((len(vertices), 4))
-    look: dict[str, Any] = {}
+    texture: dict[str, Any] = {}
     coordinates = np.zeros((len(vertices), 2))
     if paint.colours is not None:
         colours[:, :3] = _linear(paint.colours)
-    if paint.board is not None:
-        coordinates = 0.5 * (paint.board + 1)
-        look["baseColorTexture"] = checkerboard()
+    if paint.checkerboard is not None:
+        coordinates = 0.5 * (paint.checkerboard + 1)
+        texture["baseColorTexture"] = checkerboard()
     visual = trimesh.visual.TextureVisuals(
         uv=coordinates,
         material=trimesh.visual.material.PBRMaterial(
-            metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True, **look
+            metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True, **texture
         ),
     )
     visual.vertex_attributes["color"] = np.round(255 * colours).astype(np.uint8)
@@ -41,6 +41,6 @@ def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
 
 
 def _linear(colours: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to what glTF has at vertices: linear light."""
+    """sRGB in [0, 1] as linear RGB, which glTF expects at vertices."""
     c = np.clip(colours, 0, 1)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
