@@ -1,4 +1,4 @@
-"""Learning curves of a run, from its TensorBoard event files and CSV logs."""
+"""The learning curves of a run, from its TensorBoard event files and CSV logs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from typing import NamedTuple
 
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
-_POINTS = 500  # of a curve; more would only make the page larger
+from nsm.results.report.runs import short
+
+_POINTS = 500  # at most, per curve: more would only enlarge the page
 _NO_CURVES = ("hp_metric", "epoch")
 
 
 class Curve(NamedTuple):
-    """A scalar over the training: steps, values, and seconds since the first value, if known."""
+    """A scalar during training: steps, values and, if known, seconds since the first value."""
 
     steps: list[int]
     values: list[float | None]
@@ -23,7 +25,7 @@ class Curve(NamedTuple):
 
 
 def read_curves(folder: Path) -> tuple[dict[str, Curve], list[str]]:
-    """The curves of a run folder by their tags, and remarks on files that are damaged."""
+    """The curves of a run folder by their tags, and remarks on damaged files."""
     curves: dict[str, Curve] = {}
     remarks = []
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
@@ -31,12 +33,12 @@ def read_curves(folder: Path) -> tuple[dict[str, Curve], list[str]]:
         try:
             curves.update(_from_csv(file))
         except (OSError, ValueError, csv.Error) as error:
-            remarks.append(f"{file.relative_to(folder)}: {' '.join(str(error).split())[:120]}")
+            remarks.append(f"{file.relative_to(folder)}: {short(error)}")
     for place in sorted({file.parent for file in folder.rglob("events.out.tfevents.*")}):
         try:
             curves.update(_from_events(place))
-        except Exception as error:  # the reader has no exception of its own for damaged files
-            remarks.append(f"{place.relative_to(folder)}: {' '.join(str(error).split())[:120]}")
+        except Exception as error:  # the reader has no exception class for damaged files
+            remarks.append(f"{place.relative_to(folder)}: {short(error)}")
     return {tag: curves[tag] for tag in sorted(curves)}, remarks
 
 
@@ -47,7 +49,7 @@ def _from_events(place: Path) -> dict[str, Curve]:
     for tag in reader.Tags()[SCALARS]:
         if tag in _NO_CURVES:
             continue
-        # a resumed run repeats the steps after its last checkpoint: the later value counts
+        # a resumed run repeats the steps after its last checkpoint: keep the later value
         events = {event.step: event for event in reader.Scalars(tag)}
         kept = _thinned(sorted(events))
         start = events[kept[0]].wall_time
