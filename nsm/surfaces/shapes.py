@@ -128,21 +128,12 @@ def torus(around: int = 64, across: int = 32, tube: float = 0.4) -> Mesh:
 
 def sphere(subdivisions: int = 4) -> Mesh:
     """The unit sphere as a subdivided icosahedron; 10 * 4^subdivisions + 2 vertices."""
-    g = (1 + 5**0.5) / 2
-    vertices = np.array(
-        [
-            (-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g),
-            (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1),
-        ]
-    )  # fmt: skip
-    faces = np.array(
-        [
-            (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
-            (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
-            (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1),
-        ],
-        dtype=np.int64,
-    )  # fmt: skip
+    from trimesh.creation import icosahedron
+
+    base = icosahedron()
+    # with the vertices (±1, ±g, 0) and so on, where g is the golden ratio
+    vertices = np.array(base.vertices / base.vertices[1, 0])
+    faces = np.array(base.faces, dtype=np.int64)
     for _ in range(subdivisions):
         edges = topology.edges_of(faces)
         ab, bc, ca = (len(vertices) + edges.of_corner).T

@@ -21,9 +21,12 @@ from nsm.results.tables import FIGURES
 _BINS = 60
 _HISTOGRAMS = ("symmetric dirichlet", "singular value ratio", "area")
 _LABEL_SETTINGS = 3  # at most, of the settings that differ, in the label of a run
-_HIGHER_IS_BETTER = ("covered_percent",)
-_ZERO_IS_BEST = ("normal_variation_excess_degrees",)
-_NEITHER = ("steps", "certified")
+_BEST = {
+    "covered_percent": "high",
+    "normal_variation_excess_degrees": "zero",
+    "steps": "none",
+    "certified": "none",
+}  # of the figures for which it is not the lowest value
 
 
 class _Arrays:
@@ -157,14 +160,8 @@ def _described(keys: set[str]) -> list[dict[str, Any]]:
     result = []
     for key in sorted(keys, key=lambda k: (order.get(k, len(order)), k)):
         label, unit = FIGURES.get(key, (key.replace("_", " "), ""))
-        best = "low"
-        if key in _HIGHER_IS_BETTER:
-            best = "high"
-        elif key in _ZERO_IS_BEST:
-            best = "zero"
-        elif key in _NEITHER or key not in FIGURES:
-            best = "none"
         main = key in FIGURES
+        best = _BEST.get(key, "low" if main else "none")
         result.append({"key": key, "label": label, "unit": unit, "best": best, "main": main})
     return result
 

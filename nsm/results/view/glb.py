@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.visual.color import srgb_to_linear
 
 from nsm.results.textures import checkerboard
 from nsm.results.view.scene import Paint, Shape
@@ -17,7 +18,7 @@ def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
     texture: dict[str, Any] = {}
     coordinates = np.zeros((len(vertices), 2))
     if paint.colours is not None:
-        colours[:, :3] = _linear(paint.colours)
+        colours[:, :3] = srgb_to_linear(np.clip(paint.colours, 0, 1))  # as glTF expects
     if paint.checkerboard is not None:
         coordinates = 0.5 * (paint.checkerboard + 1)
         texture["baseColorTexture"] = checkerboard()
@@ -38,9 +39,3 @@ def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
     data = trimesh.Scene(mesh).export(file_type="glb", include_normals=True)
     assert isinstance(data, bytes)
     return data
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] as linear RGB, which glTF expects at vertices."""
-    c = np.clip(colours, 0, 1)
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -23,14 +23,10 @@ from nsm.surfaces.topology import edges_of
 
 POSITION, PLAIN = "position on the source", "plain"
 # rotations of each axis to y, the upward axis of a view
-_Y = np.eye(3)
 UP_AXES = {
-    "y": _Y,
-    "z": _Y[[1, 2, 0]],
-    "x": _Y[[2, 0, 1]],
-    "-y": np.diag([-1.0, -1.0, 1.0]),
-    "-z": np.diag([-1.0, -1.0, 1.0]) @ _Y[[1, 2, 0]],
-    "-x": np.diag([-1.0, -1.0, 1.0]) @ _Y[[2, 0, 1]],
+    sign + axis: flip @ np.roll(np.eye(3), -k, axis=0)
+    for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
+    for k, axis in enumerate("yzx")
 }
 _GAP = 0.2  # between the shapes, in widths of the wider one
 _FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; others use percentiles
