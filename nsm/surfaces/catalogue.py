@@ -16,6 +16,7 @@ from nsm.surfaces.cache import cache_folder
 from nsm.surfaces.loading import error_in, load_mesh
 
 TIMEOUT_SECONDS = 30
+_INSTEAD = "use surface=terrain or surface.path=FILE, or set NSM_MESH_URL to a mirror"
 _CLASSIC = "https://raw.githubusercontent.com/alecjacobson/common-3d-test-models/master/data"
 _ANIMALS = (
     "https://raw.githubusercontent.com/patr-schm/surface-maps-via-adaptive-triangulations/"
@@ -148,26 +149,17 @@ def _fetch(name: str, remote: _Remote) -> tuple[np.ndarray, np.ndarray]:
             downloader=pooch.HTTPDownloader(timeout=TIMEOUT_SECONDS),
         )
     except PermissionError as error:
-        raise error_in(
-            name,
-            "cache_not_writable",
-            f"cannot write to {error.filename or cache_folder()}; set NSM_CACHE to a "
-            "writable folder",
-        ) from error
+        reason = f"cannot write to {error.filename or cache_folder()}"
+        raise error_in(name, "cache_not_writable", f"{reason}; set NSM_CACHE") from error
     except OSError as error:  # requests' errors are OSErrors: no network, no such file, timeout
-        raise error_in(
-            name,
-            "download_failed",
-            f"cannot download {url} ({type(error).__name__}); without a network use "
-            "surface=terrain or surface.path=FILE, or set NSM_MESH_URL to a mirror",
-        ) from error
+        reason = f"cannot download {url} ({type(error).__name__}); {_INSTEAD}"
+        raise error_in(name, "download_failed", reason) from error
     except ValueError as error:  # pooch raises it for a wrong checksum and for an unusable address
-        wrong = "hash" in str(error)
-        raise error_in(
-            name,
-            "wrong_checksum" if wrong else "download_failed",
-            f"{url} {'has the wrong checksum' if wrong else 'is not a usable address'}; "
-            "check NSM_MESH_URL, or use surface=terrain or surface.path=FILE",
-        ) from error
+        kind, reason = (
+            ("wrong_checksum", "has the wrong checksum")
+            if "hash" in str(error)
+            else ("download_failed", "is not a usable address")
+        )
+        raise error_in(name, kind, f"{url} {reason}; {_INSTEAD}") from error
     vertices, faces, _ = load_mesh(file)
     return vertices, faces

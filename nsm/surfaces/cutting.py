@@ -60,6 +60,10 @@ def first_copies(origin: np.ndarray, count: int) -> np.ndarray:
     return first
 
 
+def _seam_error(name: str, kind: str, reason: str) -> NsmError:
+    return NsmError(f"{name}: {reason}", kind=kind, key=_SEAM_KEY)
+
+
 class _Graph:
     """The edge graph of a mesh, with each boundary loop contracted to one node."""
 
@@ -138,21 +142,14 @@ def cut_to_disc(
     if seam_vertices is not None:
         for v in seam_vertices:
             if not 0 <= int(v) < len(vertices):
-                raise NsmError(
-                    f"{name}: there is no seam vertex {v}; give vertices from 0 to "
-                    f"{len(vertices) - 1}",
-                    kind="out_of_range",
-                    key=_SEAM_KEY,
-                )
+                reason = f"there is no seam vertex {v}; give vertices 0 to {len(vertices) - 1}"
+                raise _seam_error(name, "out_of_range", reason)
         given = [int(graph.node[int(v)]) for v in seam_vertices]
         terminals += [v for v in dict.fromkeys(given) if v not in terminals]
         log.append(f"seam through {len(given)} given vertices")
         if not graph.loops and genus == 0 and len(terminals) < 2:
-            raise NsmError(
-                f"{name}: the surface is closed; give at least two different seam vertices",
-                kind="too_few",
-                key=_SEAM_KEY,
-            )
+            reason = "the surface is closed; give at least two different seam vertices"
+            raise _seam_error(name, "too_few", reason)
     elif genus == 0 and _almost_closed(vertices, faces, graph.loops):
         farthest = _farthest_points(graph, terminals, FARTHEST_POINTS)
         terminals += [v for v in farthest if v not in terminals]
@@ -190,14 +187,10 @@ def _cut_open(
     is_cut[seam] = True
     cut_faces, origin = topology.cut_along(faces, is_cut)
     if not topology.is_disc(cut_faces):
-        raise NsmError(
-            f"{name}: the seam does not leave a disc (Euler characteristic "
-            f"{topology.euler_characteristic(cut_faces)}, "
-            f"{len(topology.boundary_loops(cut_faces))} boundary loops); "
-            f"give other {_SEAM_KEY}",
-            kind="not_a_disc",
-            key=_SEAM_KEY,
-        )
+        euler, loops = topology.euler_characteristic(cut_faces), topology.boundary_loops(cut_faces)
+        found = f"Euler characteristic {euler}, {len(loops)} boundary loops"
+        reason = f"the seam does not leave a disc ({found}); give other {_SEAM_KEY}"
+        raise _seam_error(name, "not_a_disc", reason)
     points, cut_faces, inserted = _split_chords(vertices[origin], cut_faces)
     if inserted:
         log = [*log, f"{inserted} interior edges between boundary vertices split"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from nsm.surfaces.loading import error_in
+from nsm.surfaces.loading import check_file, error_in
 
 Landmarks = list[int] | np.ndarray
 _ENDINGS = (".vts", ".txt", ".pinned", ".json")
@@ -26,29 +25,22 @@ def read_landmarks(path: str | Path) -> Landmarks:
     list of numbers, or of points [x, y, z].
 
     Raises:
-        NsmError: ``unknown_format``, ``no_landmarks``, ``missing_file``, ``unreadable_file``,
-            ``damaged_file`` or ``wrong_type``. The key is the path, here and below.
+        NsmError: ``no_landmarks``, ``damaged_file``, ``wrong_type``, or as
+            :func:`nsm.surfaces.loading.check_file`. The key is the path.
     """
     file = Path(path)
-    if file.suffix.lower() not in _ENDINGS:
-        raise error_in(
-            file, "unknown_format", f"unknown format of landmarks; use one of {', '.join(_ENDINGS)}"
-        )
     if file.suffix.lower() == ".json":
         return listed(_json(file), str(file))
     result = []
-    for number, line in enumerate(_text(file).splitlines(), start=1):
+    for number, line in enumerate(_text(file, _ENDINGS).splitlines(), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
         try:
             result.append(int(fields[0]))
         except ValueError:
-            raise error_in(
-                file,
-                "damaged_file",
-                f"line {number} does not start with a vertex number; give one landmark per line",
-            ) from None
+            reason = f"line {number} does not start with a vertex number"
+            raise error_in(file, "damaged_file", reason) from None
     if not result:
         raise error_in(file, "no_landmarks", "no landmarks; give one vertex number per line")
     return result
@@ -61,7 +53,7 @@ def read_pairs(path: str | Path) -> tuple[Landmarks, Landmarks]:
     of pairs. Each landmark is a vertex number or a point [x, y, z].
 
     Raises:
-        NsmError: ``missing_file``, ``unreadable_file``, ``damaged_file`` or ``wrong_type``.
+        NsmError: as :func:`read_landmarks`.
     """
     file = Path(path)
     content = _json(file)
@@ -70,9 +62,8 @@ def read_pairs(path: str | Path) -> tuple[Landmarks, Landmarks]:
         return source, target
     pairs = content.get("pairs") if isinstance(content, dict) else content
     if not isinstance(pairs, list) or not all(isinstance(p, list) and len(p) == 2 for p in pairs):
-        raise error_in(
-            file, "wrong_type", 'give {"source": [...], "target": [...]} or a list of pairs'
-        )
+        reason = 'give {"source": [...], "target": [...]} or a list of pairs'
+        raise error_in(file, "wrong_type", reason)
     return listed([p[0] for p in pairs], str(file)), listed([p[1] for p in pairs], str(file))
 
 
@@ -82,7 +73,7 @@ def read_collection(path: str | Path) -> list[Landmarks]:
     The file has {"landmarks": [[...], ...]}, or only the lists, one per surface.
 
     Raises:
-        NsmError: as :func:`read_pairs`.
+        NsmError: as :func:`read_landmarks`.
     """
     file = Path(path)
     content = _json(file)
@@ -111,31 +102,21 @@ def as_vertices(
         distance, nearest = cKDTree(vertices).query(given)
         limit = _FAR * float(np.linalg.norm(np.ptp(vertices, axis=0)))
         for k in np.flatnonzero(distance > limit)[:1].tolist():
-            raise error_in(
-                name,
-                "not_on_surface",
-                f"landmark {k} at {given[k].tolist()} is {distance[k]:.3g} away from the "
-                "mesh; give a point on the mesh, in the units of its file",
-            )
+            where = f"landmark {k} at {given[k].tolist()} is {distance[k]:.3g} away from the mesh"
+            reason = f"{where}; give points on the mesh, in the units of its file"
+            raise error_in(name, "not_on_surface", reason)
         ids = nearest.astype(np.int64)
     else:
         for k, vertex in enumerate(given):
             if not 0 <= vertex < len(vertices):
-                raise error_in(
-                    name,
-                    "out_of_range",
-                    f"landmark {k} is vertex {vertex}, but the mesh has vertices 0 to "
-                    f"{len(vertices) - 1}; give one of these",
-                )
+                reason = f"landmark {k} is vertex {vertex}; give vertices 0 to {len(vertices) - 1}"
+                raise error_in(name, "out_of_range", reason)
         ids = np.array(given, dtype=np.int64)
     seen: dict[int, int] = {}
     for k, vertex in enumerate(ids.tolist()):
         if vertex in seen:
-            raise error_in(
-                name,
-                "duplicate_landmark",
-                f"landmarks {seen[vertex]} and {k} are both vertex {vertex}; leave one of them out",
-            )
+            reason = f"landmarks {seen[vertex]} and {k} are both vertex {vertex}; leave one out"
+            raise error_in(name, "duplicate_landmark", reason)
         seen[vertex] = k
     return ids
 
@@ -148,9 +129,7 @@ def check_equal_lengths(names: Sequence[str], lists: Sequence[Landmarks]) -> Non
     """
     counts = [len(item) for item in lists]
     if len(set(counts)) > 1:
-        listing = ", ".join(
-            f"{name} has {count}" for name, count in zip(names, counts, strict=True)
-        )
+        listing = ", ".join(f"{n} has {count}" for n, count in zip(names, counts, strict=True))
         reason = f"{listing}; give the same landmarks on each surface, in the same order"
         raise error_in("landmarks", "different_lengths", reason)
 
@@ -180,22 +159,16 @@ def listed(given: Any, what: str) -> Landmarks:
     if all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in given):
         for k, x in enumerate(given):
             if not float(x).is_integer():  # np.loadtxt returns integers as floats
-                raise error_in(
-                    what,
-                    "wrong_type",
-                    f"landmark {k} is {x}; vertex numbers are whole, points [x, y, z]",
-                )
+                reason = f"landmark {k} is {x}; vertex numbers are whole, points [x, y, z]"
+                raise error_in(what, "wrong_type", reason)
         return [int(x) for x in given]
     try:
         points = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         points = np.zeros(0)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise error_in(
-            what,
-            "wrong_type",
-            "give landmarks either all as vertex numbers or all as points [x, y, z]",
-        )
+        reason = "give landmarks either all as vertex numbers or all as points [x, y, z]"
+        raise error_in(what, "wrong_type", reason)
     return points
 
 
@@ -207,18 +180,11 @@ def _json(file: Path) -> Any:
         raise error_in(file, "damaged_file", f"not readable as JSON ({reason})") from error
 
 
-def _text(file: Path) -> str:
+def _text(file: Path, endings: Sequence[str] = ()) -> str:
+    check_file(file, _LARGEST, endings)
     try:
-        status = file.stat()
-        if not stat.S_ISREG(status.st_mode):  # reading a pipe blocks
-            raise error_in(file, "not_a_file", "not a regular file; give a list of landmarks")
-        if status.st_size > _LARGEST:
-            size = f"larger than {_LARGEST // 1_000_000} MB; give a list of landmarks"
-            raise error_in(file, "file_too_large", size)
         return file.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise error_in(file, "damaged_file", "not a text file") from error
-    except (OSError, ValueError) as error:
-        kind = "missing_file" if isinstance(error, FileNotFoundError) else "unreadable_file"
-        reason = getattr(error, "strerror", None) or "not a path"
-        raise error_in(file, kind, f"{reason}; check the path") from error
+    except OSError as error:
+        raise error_in(file, "unreadable_file", error.strerror or "cannot be read") from error

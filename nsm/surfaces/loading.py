@@ -38,6 +38,29 @@ def is_mesh_path(text: str) -> bool:
     return "=" not in text and PurePath(text).suffix.lower() in EXTENSIONS
 
 
+def check_file(file: Path, largest: int, endings: Sequence[str] = ()) -> None:
+    """Check that a file is regular, has at most ``largest`` bytes and, if given, a known ending.
+
+    Raises:
+        NsmError: ``missing_file``, ``unreadable_file``, ``not_a_file``, ``unknown_format`` or
+            ``file_too_large``. The key is the path.
+    """
+    try:
+        status = file.stat()
+    except FileNotFoundError:
+        raise error_in(file, "missing_file", "no such file; check the path") from None
+    except (OSError, ValueError) as error:  # too long, a loop of links, not allowed, a NUL in it
+        reason = getattr(error, "strerror", None) or "not a path"
+        raise error_in(file, "unreadable_file", f"{reason}; check the path") from error
+    if not stat.S_ISREG(status.st_mode):  # reading a pipe blocks, reading a device never ends
+        raise error_in(file, "not_a_file", "not a regular file; give a file")
+    if endings and file.suffix.lower() not in endings:
+        reason = f"unknown format '{file.suffix}'; use one of {', '.join(endings)}"
+        raise error_in(file, "unknown_format", reason)
+    if status.st_size > largest:
+        raise error_in(file, "file_too_large", f"larger than {largest / 2**20:.0f} MB")
+
+
 def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Read a mesh file.
 
@@ -46,47 +69,21 @@ def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
         log line per conversion.
 
     Raises:
-        NsmError: ``missing_file``, ``not_a_file``, ``unknown_format``, ``file_too_large``,
-            ``unreadable_file``, or as :func:`check_arrays`. The key is the path.
+        NsmError: ``unreadable_file``, or as :func:`check_file` and :func:`check_arrays`. The key
+            is the path.
     """
     file = Path(path)
     suffix = file.suffix.lower()
-    try:
-        status = file.stat()
-    except FileNotFoundError:
-        raise error_in(file, "missing_file", "no such file; check the path") from None
-    except (OSError, ValueError) as error:  # too long, a loop of links, not allowed, a NUL in it
-        reason = getattr(error, "strerror", None) or "not a path"
-        raise error_in(file, "unreadable_file", f"{reason}; check the path") from error
-    if stat.S_ISDIR(status.st_mode):
-        raise error_in(file, "not_a_file", "is a folder; give a mesh file")
-    if suffix not in EXTENSIONS:
-        raise error_in(
-            file,
-            "unknown_format",
-            f"unknown mesh format '{suffix}'; use one of {', '.join(EXTENSIONS)}",
-        )
-    if not stat.S_ISREG(status.st_mode):  # reading a pipe blocks, reading a device never ends
-        raise error_in(file, "not_a_file", "not a regular file; give a mesh file")
-    if status.st_size > LARGEST_FILE:
-        raise error_in(
-            file,
-            "file_too_large",
-            f"larger than {LARGEST_FILE / 2**30:.0f} GB; simplify the mesh first",
-        )
+    check_file(file, LARGEST_FILE, EXTENSIONS)
     reader = {".obj": _read_obj, ".off": _read_off, ".ply": _read_ply}.get(suffix, _read_trimesh)
     try:
         vertices, faces, log = reader(file)
     except NsmError:
         raise
     except Exception as error:  # parsers raise any exception on damaged files
-        reason = " ".join(str(error).split())[:150] or type(error).__name__
-        raise error_in(
-            file,
-            "unreadable_file",
-            f"not a readable {suffix[1:].upper()} mesh ({reason}); "
-            "the file may be truncated or in another format: export it again",
-        ) from error
+        cause = " ".join(str(error).split())[:150] or type(error).__name__
+        reason = f"not a readable {suffix[1:].upper()} mesh ({cause}); export it again"
+        raise error_in(file, "unreadable_file", reason) from error
     check_arrays(vertices, faces, str(file))
     return vertices, faces, tuple(log)
 
@@ -106,9 +103,8 @@ def as_arrays(vertices: Any, faces: Any, name: str) -> tuple[np.ndarray, np.ndar
         if not np.array_equal(faces, given):
             raise ValueError
     except (TypeError, ValueError) as error:
-        raise error_in(
-            name, "wrong_type", "give vertices as real numbers (V, 3) and faces as integers (F, 3)"
-        ) from error
+        reason = "give vertices as real numbers (V, 3) and faces as integers (F, 3)"
+        raise error_in(name, "wrong_type", reason) from error
     return vertices.astype(np.float64), faces
 
 
@@ -121,27 +117,18 @@ def check_arrays(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     """
     for what, array in (("vertices", vertices), ("faces", faces)):
         if array.size and (array.ndim != 2 or array.shape[1] != 3):
-            raise error_in(
-                name,
-                "wrong_shape",
-                f"{what} have the shape {array.shape}; give vertices (V, 3) and triangles (F, 3)",
-            )
+            reason = f"{what} have the shape {array.shape}; give vertices and triangles (N, 3)"
+            raise error_in(name, "wrong_shape", reason)
         if array.size == 0:
             raise error_in(name, "not_a_mesh", f"no {what}; give a triangle mesh")
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
-        raise error_in(
-            name,
-            "not_finite",
-            f"vertex {int(finite.argmin())} is NaN or infinite; repair it in a mesh editor",
-        )
+        reason = f"vertex {int(finite.argmin())} is NaN or infinite; repair it in a mesh editor"
+        raise error_in(name, "not_finite", reason)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise error_in(
-            name,
-            "out_of_range",
-            f"a face uses vertex {int(faces.max() if faces.min() >= 0 else faces.min())}"
-            f", but there are {len(vertices)}; the file is truncated or damaged: export it again",
-        )
+        wrong = int(faces.max() if faces.min() >= 0 else faces.min())
+        reason = f"a face uses vertex {wrong}, but there are {len(vertices)}; export it again"
+        raise error_in(name, "out_of_range", reason)
 
 
 _Read = tuple[np.ndarray, np.ndarray, list[str]]

@@ -76,12 +76,9 @@ def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanM
     edges = topology.edges_of(faces)
     if edges.count.max() > 2:
         a, b = edges.pairs[int(edges.count.argmax())]
-        raise error_in(
-            name,
-            "non_manifold",
-            f"{int((edges.count > 2).sum())} non-manifold edges, with more than two faces "
-            f"(such as the edge of vertices {a} and {b}); remove inner faces in a mesh editor",
-        )
+        count = int((edges.count > 2).sum())
+        where = f"{count} non-manifold edges (three or more faces), such as {a}-{b}"
+        raise error_in(name, "non_manifold", f"{where}; remove inner faces in a mesh editor")
     faces = _keep_largest_component(vertices, faces, name, log)
     faces = _orient(faces, name, log)
 
@@ -104,12 +101,9 @@ def _check_size(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     used = vertices[np.unique(faces)]
     largest = float(np.abs(used).max())
     if largest > LARGEST or 0 < np.ptp(used, axis=0).max() < SMALLEST:
-        raise error_in(
-            name,
-            "out_of_range",
-            f"too {'large' if largest > LARGEST else 'small'} for single precision "
-            f"(coordinates up to {largest:.3g}); scale the mesh",
-        )
+        size = "large" if largest > LARGEST else "small"
+        reason = f"too {size} for single precision (coordinates up to {largest:.3g}); scale it"
+        raise error_in(name, "out_of_range", reason)
 
 
 def _weld_duplicates(vertices: np.ndarray, faces: np.ndarray, log: list[str]) -> np.ndarray:
@@ -194,9 +188,7 @@ def _remove_degenerate(
     faces = faces[distinct]
     degenerate = _is_degenerate(vertices, faces, limit)
     if degenerate.all():
-        raise error_in(
-            name, "degenerate", "all triangles are degenerate; give a mesh that is not collapsed"
-        )
+        raise error_in(name, "degenerate", "all triangles are degenerate; give another mesh")
     if degenerate.any():
         # removing a degenerate triangle inside would leave a hole: only an edge flip keeps the
         # surface closed
@@ -204,12 +196,9 @@ def _remove_degenerate(
         faces, flipped, removed = _flip_degenerate(vertices, faces, degenerate, limit)
         kept = faces[_first_uses(faces)]
         if len(kept) == 0 or topology.euler_characteristic(kept) != before:
-            raise error_in(
-                name,
-                "degenerate",
-                f"removing {removed} degenerate triangles would leave holes; merge "
-                "vertices by distance in a mesh editor",
-            )
+            where = f"removing {removed} degenerate triangles would leave holes"
+            reason = f"{where}; merge vertices by distance in a mesh editor"
+            raise error_in(name, "degenerate", reason)
         if flipped:
             log.append(f"{flipped} degenerate triangles removed by edge flips")
         if removed:
@@ -310,15 +299,10 @@ def _keep_largest_component(
     others = np.delete(share, largest)
     if others.max() >= DROPPED_SHARE or others.sum() >= DROPPED_TOTAL:
         listed = ", ".join(f"{100 * s:.1f} %" for s in np.sort(share)[::-1][:6])
-        raise error_in(
-            name,
-            "disconnected",
-            f"{count} connected components ({listed} of the area); "
-            "keep one of them, or join them, in a mesh editor",
-        )
-    log.append(
-        f"{count - 1} small connected components removed ({100 * others.sum():.2f} % of the area)"
-    )
+        where = f"{count} connected components ({listed} of the area)"
+        raise error_in(name, "disconnected", f"{where}; keep one, or join them, in a mesh editor")
+    dropped = 100 * others.sum()
+    log.append(f"{count - 1} small connected components removed ({dropped:.2f} % of the area)")
     return faces[label == largest]
 
 
@@ -337,11 +321,8 @@ def _orient(faces: np.ndarray, name: str, log: list[str]) -> np.ndarray:
     graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(2 * n, 2 * n)).tocsr()
     label = connected_components(graph, directed=False)[1]
     if (label[:n] == label[n:]).any():
-        raise error_in(
-            name,
-            "not_orientable",
-            "non-orientable (one-sided) surface; cut it open in a mesh editor",
-        )
+        reason = "non-orientable (one-sided) surface; cut it open in a mesh editor"
+        raise error_in(name, "not_orientable", reason)
     flipped = np.zeros(n, dtype=bool)
     done = np.zeros(n, dtype=bool)
     while not done.all():

@@ -34,25 +34,16 @@ def write_report(
             ``not_writable`` (key: the output).
     """
     if not output.parent.is_dir():
-        raise NsmError(
-            f"{output}: there is no folder {output.parent}; create it first",
-            kind="missing_folder",
-            key=str(output),
-        )
+        reason = f"{output}: there is no folder {output.parent}; create it first"
+        raise NsmError(reason, kind="missing_folder", key=str(output))
     if output.is_dir():
-        raise NsmError(
-            f"{output}: is a folder; give a file name for the page",
-            kind="not_a_file",
-            key=str(output),
-        )
+        reason = f"{output}: is a folder; give a file name for the page"
+        raise NsmError(reason, kind="not_a_file", key=str(output))
     runs, incomplete = find_runs(folders)
     text = page(title, content(title, runs, incomplete, trust))
     try:
         atomic_write(output, text.encode())
     except OSError as error:
-        raise NsmError(
-            f"{output}: {error.strerror}; give another --output",
-            kind="not_writable",
-            key=str(output),
-        ) from error
+        reason = f"{output}: {error.strerror}; give another --output"
+        raise NsmError(reason, kind="not_writable", key=str(output)) from error
     return len(runs), len(incomplete)

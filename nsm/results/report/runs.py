@@ -57,11 +57,8 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
     seen: set[Path] = set()
     for folder in folders:
         if not folder.is_dir():
-            raise NsmError(
-                f"{folder}: no such folder; give folders of runs or sweeps",
-                kind="missing_folder",
-                key=str(folder),
-            )
+            reason = f"{folder}: no such folder; give folders of runs or sweeps"
+            raise NsmError(reason, kind="missing_folder", key=str(folder))
         for place in run_folders(folder):
             if place.resolve() in seen:
                 continue
@@ -79,11 +76,8 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
                 incomplete.append(Incomplete(name, str(error)))
     if not runs and not incomplete:
         listing = ", ".join(str(folder) for folder in folders)
-        raise NsmError(
-            f"{listing}: no runs found; the folder of a run has a metrics.json",
-            kind="no_runs",
-            key=listing,
-        )
+        reason = f"{listing}: no runs found; the folder of a run has a metrics.json"
+        raise NsmError(reason, kind="no_runs", key=listing)
     return runs, incomplete
 
 

@@ -315,11 +315,8 @@ def _silenced() -> contextlib.redirect_stdout[io.StringIO]:
 def _check_address(host: str, port: int) -> None:
     """Raise an error if viser cannot listen there: it would try other ports and then hang."""
     if not 0 <= port < 2**16:
-        raise NsmError(
-            f"port {port}: give a number from 1 to 65535, or 0 for any free port",
-            kind="out_of_range",
-            key="port",
-        )
+        reason = f"port {port}: give a number from 1 to 65535, or 0 for any free port"
+        raise NsmError(reason, kind="out_of_range", key="port")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(kind, socket.SOCK_STREAM) as trial:
@@ -328,16 +325,10 @@ def _check_address(host: str, port: int) -> None:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise _in_use(port) from error
-        raise NsmError(
-            f"cannot listen on {host}, port {port}: {error.strerror}; give another --host",
-            kind="address_not_available",
-            key="host",
-        ) from error
+        reason = f"cannot listen on {host}, port {port}: {error.strerror}; give another --host"
+        raise NsmError(reason, kind="address_not_available", key="host") from error
 
 
 def _in_use(port: int) -> NsmError:
-    return NsmError(
-        f"port {port} is in use; give another one, or --port 0 for any free port",
-        kind="port_in_use",
-        key="port",
-    )
+    reason = f"port {port} is in use; give another one, or --port 0 for any free port"
+    return NsmError(reason, kind="port_in_use", key="port")
