@@ -119,12 +119,8 @@ def _weld_duplicates(vertices: np.ndarray, faces: np.ndarray, log: list[str]) ->
     if duplicates == 0:
         return keep
     soup = len(faces) > 1 and len(np.unique(faces)) == faces.size
-    if not soup and _most_faces_at_an_edge(representative[faces]) > 2 >= _most_faces_at_an_edge(
-        faces
-    ):
-        log.append(
-            f"{duplicates} duplicate vertices kept: welding them would make edges non-manifold"
-        )
+    if not soup and _makes_non_manifold(faces, representative[faces]):
+        log.append(f"{duplicates} duplicate vertices kept: welding would make edges non-manifold")
         return keep
     log.append(f"{duplicates} duplicate vertices welded")
     return representative
@@ -149,18 +145,25 @@ def _weld_short_edges(
     graph = coo_matrix((np.ones(len(short)), tuple(short.T)), shape=(n, n))
     label = connected_components(graph, directed=False)[1]
     welded = np.unique(label, return_index=True)[1][label][representative]
-    if _most_faces_at_an_edge(welded[faces]) > 2 >= _most_faces_at_an_edge(joined):
+    if _makes_non_manifold(joined, welded[faces]):
         return representative
     count = len(np.unique(joined)) - len(np.unique(welded[faces]))
     log.append(f"{count} vertices welded across edges of zero length")
     return welded
 
 
-def _most_faces_at_an_edge(faces: np.ndarray) -> int:
-    """The most faces at one edge, without duplicate faces and those that repeat a vertex."""
-    faces = faces[_distinct_corners(faces)]
-    faces = faces[_first_uses(faces)]
-    return int(topology.edges_of(faces).count.max()) if len(faces) else 0
+def _makes_non_manifold(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether edges have more than two faces after welding (F, 3), but not before.
+
+    Duplicate faces and faces that repeat a vertex do not count.
+    """
+
+    def most(faces: np.ndarray) -> int:
+        faces = faces[_distinct_corners(faces)]
+        faces = faces[_first_uses(faces)]
+        return int(topology.edges_of(faces).count.max()) if len(faces) else 0
+
+    return most(after) > 2 >= most(before)
 
 
 def _distinct_corners(faces: np.ndarray) -> np.ndarray:

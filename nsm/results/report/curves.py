@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,13 +52,8 @@ def _from_events(place: Path) -> dict[str, Curve]:
             continue
         # a resumed run repeats the steps after its last checkpoint: keep the later value
         events = {event.step: event for event in reader.Scalars(tag)}
-        kept = _thinned(sorted(events))
-        start = events[kept[0]].wall_time
-        curves[tag] = Curve(
-            kept,
-            [_finite(events[step].value) for step in kept],
-            [round(events[step].wall_time - start, 3) for step in kept],
-        )
+        times = {step: event.wall_time for step, event in events.items()}
+        curves[tag] = _curve({step: event.value for step, event in events.items()}, times)
     return curves
 
 
@@ -69,17 +65,17 @@ def _from_csv(file: Path) -> dict[str, Curve]:
         for tag, text in row.items():
             if tag not in ("step", *_NO_CURVES) and tag and text:
                 values.setdefault(tag, {})[int(row["step"])] = float(text)
-    curves = {}
-    for tag, by_step in values.items():
-        kept = _thinned(sorted(by_step))
-        curves[tag] = Curve(kept, [_finite(by_step[step]) for step in kept], None)
-    return curves
+    return {tag: _curve(by_step) for tag, by_step in values.items()}
 
 
-def _thinned(steps: list[int]) -> list[int]:
-    stride = -(-len(steps) // _POINTS)
-    kept = steps[::stride]
-    return kept if kept[-1] == steps[-1] else [*kept, steps[-1]]
+def _curve(values: Mapping[int, float], times: Mapping[int, float] | None = None) -> Curve:
+    """The curve of values and times by step, thinned but with its last step."""
+    steps = sorted(values)
+    kept = steps[:: -(-len(steps) // _POINTS)]
+    if kept[-1] != steps[-1]:
+        kept.append(steps[-1])
+    seconds = [round(times[step] - times[kept[0]], 3) for step in kept] if times else None
+    return Curve(kept, [_finite(values[step]) for step in kept], seconds)
 
 
 def _finite(value: float) -> float | None:
