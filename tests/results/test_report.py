@@ -75,8 +75,8 @@ def task(page: Path, name: str) -> dict:
     return next(one for one in content(page)["tasks"] if one["name"] == name)
 
 
-def unpacked(words: dict, index: int) -> np.ndarray:
-    stored = words["arrays"][index]
+def unpacked(content: dict, index: int) -> np.ndarray:
+    stored = content["arrays"][index]
     return np.frombuffer(base64.b64decode(stored["data"]), "<" + stored["type"])
 
 
@@ -85,15 +85,15 @@ def test_figures_and_settings_are_those_of_the_runs(runs, page):
     assert overfit["differing"][0] == "activation"
     assert {one["label"] for one in overfit["runs"]} >= {"activation=silu", "activation=relu"}
     for one in overfit["runs"]:
-        words = json.loads((runs / one["name"] / "metrics.json").read_text())
-        assert one["figures"].items() >= words["metrics"].items()
+        stored = json.loads((runs / one["name"] / "metrics.json").read_text())
+        assert one["figures"].items() >= stored["metrics"].items()
         assert one["figures"]["steps"] == 20
     flat = task(page, "param")["runs"][0]["figures"]
-    words = json.loads((runs / "flat" / "metrics.json").read_text())["metrics"]
-    ours = words["nsm"]
+    maps = json.loads((runs / "flat" / "metrics.json").read_text())["metrics"]
+    ours = maps["nsm"]
     assert flat.pop("certified") == {True: "yes", False: "no"}[ours.pop("certified")]
     assert flat.items() >= ours.items()
-    assert flat["SLIM (libigl): area_median"] == words["SLIM (libigl)"]["area_median"]
+    assert flat["SLIM (libigl): area_median"] == maps["SLIM (libigl)"]["area_median"]
 
 
 def test_figures_of_a_collection_are_the_means_of_its_pairs(runs, tmp_path):
@@ -159,16 +159,16 @@ def test_histograms_are_the_distortion_of_the_triangles(runs, page):
 
 
 def test_shapes_are_those_of_the_runs_and_shared_arrays_are_stored_once(runs, page):
-    words = content(page)
-    overfit = next(one for one in words["tasks"] if one["name"] == "overfit")
+    shown = content(page)
+    overfit = next(one for one in shown["tasks"] if one["name"] == "overfit")
     for one in overfit["runs"]:
         phi = load_surface(runs / one["name"])
         shape = one["shapes"][0]
-        vertices = unpacked(words, shape["vertices"]).reshape(-1, 3)
+        vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
         assert np.allclose(vertices, phi(phi.surface.uv), atol=1e-5)
-        assert np.array_equal(unpacked(words, shape["faces"]).reshape(-1, 3), phi.surface.faces)
+        assert np.array_equal(unpacked(shown, shape["faces"]).reshape(-1, 3), phi.surface.faces)
     assert len({one["shapes"][0]["faces"] for one in overfit["runs"]}) == 1
-    mapped = next(one for one in words["tasks"] if one["name"] == "pair_map")["runs"][0]
+    mapped = next(one for one in shown["tasks"] if one["name"] == "pair_map")["runs"][0]
     assert [shape["name"] for shape in mapped["shapes"]] == ["mapped onto the target", "source"]
 
 
@@ -186,27 +186,27 @@ def test_incomplete_and_damaged_runs_are_listed(runs, page, tmp_path):
     shutil.copytree(runs / "sweep" / "1", tmp_path / "worse")
     (tmp_path / "worse" / "config.yaml").write_text("a: [")
     write_report([tmp_path], tmp_path / "report.html")
-    words = content(tmp_path / "report.html")
-    lines = [f"{item['name']}: {item['reason']}" for item in words["incomplete"]]
+    shown = content(tmp_path / "report.html")
+    lines = [f"{item['name']}: {item['reason']}" for item in shown["incomplete"]]
     for part in ("surface.safetensors", "error.png", "metrics.csv", "worse: config.yaml"):
         assert any(part in line for line in lines), part
-    assert [one["name"] for one in words["tasks"][0]["runs"]] == ["bad"]
+    assert [one["name"] for one in shown["tasks"][0]["runs"]] == ["bad"]
 
 
 def test_a_fine_mesh_is_decimated_for_the_page(runs, monkeypatch, tmp_path):
     monkeypatch.setattr("nsm.results.report.shapes._FACES", 100)
     write_report([runs / "sweep" / "1"], tmp_path / "report.html")
-    words = content(tmp_path / "report.html")
+    shown = content(tmp_path / "report.html")
     phi = load_surface(runs / "sweep" / "1")
-    shape = words["tasks"][0]["runs"][0]["shapes"][0]
-    vertices = unpacked(words, shape["vertices"]).reshape(-1, 3)
-    faces = unpacked(words, shape["faces"]).reshape(-1, 3)
+    shape = shown["tasks"][0]["runs"][0]["shapes"][0]
+    vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
+    faces = unpacked(shown, shape["faces"]).reshape(-1, 3)
     assert 50 < len(faces) <= 100 < len(phi.surface.faces)
     known = phi(phi.surface.uv)
     assert all(np.abs(known - vertex).max(axis=1).min() < 1e-5 for vertex in vertices[::7])
     for colour in shape["colours"].values():
         count = len(faces) if colour["of"] == "faces" else len(vertices)
-        assert len(unpacked(words, colour["values"])) == count
+        assert len(unpacked(shown, colour["values"])) == count
 
 
 @pytest.mark.parametrize(

@@ -264,10 +264,10 @@ def test_a_mesh_for_the_browser_has_its_colours_and_normals(closed):
     for paint in (grey, Paint(None, shape.uv)):
         data = as_glb(shape, shape.vertices, paint)
         length, kind = struct.unpack("<I4s", data[12:20])
-        words = json.loads(data[20 : 20 + length])
-        (part,) = words["meshes"][0]["primitives"]
+        gltf = json.loads(data[20 : 20 + length])
+        (part,) = gltf["meshes"][0]["primitives"]
         assert set(part["attributes"]) == {"POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0"}
-        material = words["materials"][part["material"]]
+        material = gltf["materials"][part["material"]]
         assert material["doubleSided"]
         textured = "baseColorTexture" in material["pbrMetallicRoughness"]
         assert textured == (paint.checkerboard is not None)

@@ -51,18 +51,18 @@
 
   // ---- controls
   const control = (section, ...elements) => $(section + " .controls").replaceChildren(...elements);
-  const select = (words, options, key, changed) => {
+  const select = (caption, options, key, changed) => {
     if (!options.includes(choices[key])) choices[key] = options[0];
     const box = make("select");
     for (const option of options) box.append(make("option", { value: option, textContent: option }));
     box.value = choices[key] ?? "";
     box.onchange = () => { choices[key] = box.value; changed(); };
-    return make("label", {}, words, box);
+    return make("label", {}, caption, box);
   };
-  const tick = (words, key, changed) => {
+  const tick = (caption, key, changed) => {
     const box = make("input", { type: "checkbox", checked: choices[key] });
     box.onchange = () => { choices[key] = box.checked; changed(); };
-    return make("label", {}, box, words);
+    return make("label", {}, box, caption);
   };
 
   // ---- table
@@ -79,11 +79,11 @@
     return value !== 0 && Math.abs(value) < 1e-4 ? value.toExponential(2) : String(Number(value.toPrecision(4)));
   };
   const passes = (value, filter) => {
-    const words = /^\s*(<=|>=|<|>|=)\s*(-?\d*\.?\d+(?:e[-+]?\d+)?)\s*$/i.exec(filter);
-    if (!words) return String(shown(value)).toLowerCase().includes(filter.trim().toLowerCase());
+    const match = /^\s*(<=|>=|<|>|=)\s*(-?\d*\.?\d+(?:e[-+]?\d+)?)\s*$/i.exec(filter);
+    if (!match) return String(shown(value)).toLowerCase().includes(filter.trim().toLowerCase());
     if (typeof value !== "number") return false;
-    const bound = Number(words[2]);
-    return { "<": value < bound, ">": value > bound, "<=": value <= bound, ">=": value >= bound, "=": value === bound }[words[1]];
+    const bound = Number(match[2]);
+    return { "<": value < bound, ">": value > bound, "<=": value <= bound, ">=": value >= bound, "=": value === bound }[match[1]];
   };
   const compare = (a, b) => {
     if (a === null || b === null) return (a === null) - (b === null);
@@ -95,7 +95,7 @@
     const all = columns();
     const kept = task.runs.filter((run) =>
       all.every((column) => !task.filters.get(column.key) || passes(column.of(run), task.filters.get(column.key))) &&
-      [run.name, run.label, ...Object.values(run.settings).map(shown)].some((word) => String(word).toLowerCase().includes(task.search)));
+      [run.name, run.label, ...Object.values(run.settings).map(shown)].some((text) => String(text).toLowerCase().includes(task.search)));
     const by = task.sort && all.find((column) => column.key === task.sort.key);
     if (!by) return kept;
     const missing = (run) => by.of(run) === null;
@@ -288,7 +288,7 @@
     const by = select("colour", [...keys, "none"], "colour", drawShapes);
     const pages = Math.max(1, Math.ceil(shapes.length / VIEWS));
     page = Math.min(page, pages - 1);
-    const step = (words, to) => make("button", { type: "button", textContent: words, disabled: to < 0 || to >= pages, onclick: () => { page = to; drawShapes(); } });
+    const step = (symbol, to) => make("button", { type: "button", textContent: symbol, disabled: to < 0 || to >= pages, onclick: () => { page = to; drawShapes(); } });
     control("#shapes", chosen, by, ...(pages > 1 ? [step("‹", page - 1), `${page + 1} / ${pages}`, step("›", page + 1)] : []));
 
     const ranges = shapes.map(([, shape]) => shape.colours[choices.colour]?.range).filter(Boolean);
