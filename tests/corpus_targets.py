@@ -1,4 +1,4 @@
-"""What is fuzzed: functions of bytes that may raise NsmError alone; and what they start from."""
+"""Fuzz targets: functions of bytes that may raise no exception but NsmError, and their seeds."""
 
 from __future__ import annotations
 
@@ -57,14 +57,16 @@ def _saved(stem: str, folder: Path) -> None:
 
 
 def _artefact(stem: str, data: bytes) -> bool:
-    """The first line is the JSON, with the checksum of the rest, which are the arrays; what else
-    is in the folder is as it should be. What is loaded is used."""
-    words, _, arrays = data.partition(b"\n")
-    words = words.replace(b"SHA256", hashlib.sha256(arrays).hexdigest().encode())
+    """Load and use a saved result; the first line of the data is its JSON, the rest its arrays.
+
+    ``SHA256`` in the JSON is replaced by the checksum of the arrays. The other files are valid.
+    """
+    metadata, _, arrays = data.partition(b"\n")
+    metadata = metadata.replace(b"SHA256", hashlib.sha256(arrays).hexdigest().encode())
     with tempfile.TemporaryDirectory() as name, contextlib.suppress(NsmError):
         folder = Path(name)
         _saved(stem, folder)
-        (folder / f"{stem}.json").write_bytes(words)
+        (folder / f"{stem}.json").write_bytes(metadata)
         (folder / f"{stem}.safetensors").write_bytes(arrays)
         thing = nsm.load(folder)
         points = np.array([[0.1, 0.2], [-0.5, 0.3]])
@@ -80,7 +82,7 @@ def _artefact(stem: str, data: bytes) -> bool:
 
 
 def seeds(name: str) -> list[bytes]:
-    """Valid input for a target that reads what nsm itself writes."""
+    """Valid input for a target that reads files of nsm."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         if name == "checkpoint":
@@ -90,12 +92,12 @@ def seeds(name: str) -> list[bytes]:
         if name not in ARTEFACTS:
             return []
         _saved(name, folder)
-        words = json.loads((folder / f"{name}.json").read_text())
-        line = json.dumps({**words, "sha256": "SHA256"}, separators=(",", ":")).encode()
+        metadata = json.loads((folder / f"{name}.json").read_text())
+        line = json.dumps({**metadata, "sha256": "SHA256"}, separators=(",", ":")).encode()
         return [line + b"\n" + (folder / f"{name}.safetensors").read_bytes()]
 
 
-# from bytes to whether they were taken; any exception is a finding
+# functions of bytes to whether they were accepted; any exception is a finding
 TARGETS: dict[str, Callable[[bytes], bool]] = {
     **{kind: partial(_in_file, f"mesh.{kind}", _mesh) for kind in MESHES},
     "config": partial(_in_file, "config.yaml", read_config),

@@ -1,4 +1,4 @@
-"""What a fuzzer found in the readers of files, and any bytes: NsmError or a right result."""
+"""Cases found by a fuzzer, and random bytes: NsmError or a valid result."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def test_any_bytes(name, data):
 @pytest.mark.parametrize("name", TARGETS)
 @examples(10)
 @given(data=st.data())
-def test_valid_files_with_a_part_exchanged(name, data):
+def test_valid_files_with_replaced_parts(name, data):
     for seed in seeds(name):
         assert TARGETS[name](seed)
         start = data.draw(st.integers(0, len(seed)))

@@ -220,7 +220,7 @@ def unknown_format(folder: Path) -> None:
         (obj_with_nan, "bad.obj", "NaN"),
         (truncated_ply, "bad.ply", "bad.ply"),
         (text_file, "bad.off", "OFF"),
-        (two_balls, "bad.obj", "separate parts"),
+        (two_balls, "bad.obj", "connected components"),
         (moebius, "bad.obj", "non-orientable"),
         (fin, "bad.obj", "non-manifold"),
         (index_out_of_range, "bad.off", "vertex 7"),
@@ -235,7 +235,7 @@ def test_a_bad_mesh_is_one_line_and_status_2(tmp_path, here, make, file, words):
 
 def test_bad_input_in_a_process_of_its_own(tmp_path):
     two_balls(tmp_path)
-    refused(run(tmp_path, "surface.path=bad.obj"), "separate parts", tmp_path)
+    refused(run(tmp_path, "surface.path=bad.obj"), "connected components", tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Some of what ``make torture`` tries, quick enough for every change; and its result, as kept."""
+"""The quick cases of ``make torture``, and its stored results."""
 
 import json
 import os
@@ -40,24 +40,24 @@ CASES = {case.name: case for case in torture.all_cases()}
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("name", QUICK)
-def test_it_is_right_or_refused_in_one_line(name):
+def test_the_result_is_correct_or_refused_in_one_line(name):
     trial = torture.Trial(CASES[name], torture.SECONDS)
     while (result := trial.result()) is None:
         time.sleep(0.01)
     assert result["outcome"] != torture.FAILED, result["complaints"]
 
 
-def test_no_two_cases_have_one_name():
+def test_names_of_cases_are_unique():
     names = [(case.group, case.name) for case in torture.all_cases()]
     assert len(set(names)) == len(names)
 
 
-def test_the_judge_sees_what_is_wrong(tmp_path):
-    """A run that says nothing, says too much, or leaves a result where it was refused, fails."""
+def test_wrong_outcomes_are_noticed(tmp_path):
+    """No message, a second line, a traceback, or a result of a refused run is a failure."""
     case = CASES["Möbius strip"]
 
-    def judged(status, told, left=()):
-        return torture._judged(case, status, "", told, tmp_path, set(left))
+    def judged(status, stderr, left=()):
+        return torture._judge(case, status, "", stderr, tmp_path, set(left))
 
     assert judged(2, "nsm: mesh: one-sided\n") == (torture.REFUSED, "mesh: one-sided", [])
     assert judged(2, "nsm: a\nnsm: b\n")[2] and judged(2, "")[2] and judged(1, "nsm: a\n")[2]
@@ -65,7 +65,7 @@ def test_the_judge_sees_what_is_wrong(tmp_path):
     assert judged(-9, "")[2] and judged(0, "")[2] and judged(2, "Traceback\n")[2]
 
 
-def test_the_kept_result_is_of_all_cases_and_none_failed():
+def test_the_stored_results_have_all_cases_and_no_failure():
     results = json.loads(torture.RESULT.read_text())["cases"]
     assert {r["outcome"] for r in results} == {torture.SOLVED, torture.REFUSED}
     kept = {(r["group"], r["case"]) for r in results}

@@ -1,1 +1,1 @@
-"""Meshes and files that are hard to bear, and what is checked of what becomes of them."""
+"""Difficult meshes and files, and the checks of the results."""

@@ -1,10 +1,10 @@
-"""Try the command on everything that is hard to bear: ``make torture``.
+"""Run the command on difficult meshes, files and disks: ``make torture``.
 
-Each case runs ``nsm`` in a process (forked from one that has imported the libraries, so that 250 of
-them take minutes instead of hours) and folder of its own, within limits of time and memory, and
-must end in a result that is right (:mod:`torture.check`) or in one line on stderr with status 2 and
-nothing left behind. Keeps what came of each in benchmarks/results/torture.json, prints a table, and
-writes it into docs/robustness.md once every case is there; status 1 if any case failed.
+Each case runs ``nsm`` in a separate folder and process, with limits of time and memory. The process
+is forked from one that has imported the libraries, so 250 cases take minutes instead of hours. A
+case must end with a correct result (:mod:`torture.check`), or with one line on stderr, status 2 and
+no result. The outcomes are kept in benchmarks/results/torture.json; a table of them is printed and,
+once all cases have run, written to docs/robustness.md. The status is 1 if any case failed.
 
     python benchmarks/torture [--only WORD ...] [--skip WORD ...] [--jobs N]
 """
@@ -25,10 +25,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before anything starts threads, which forks would lose
+os.environ["OMP_NUM_THREADS"] = "1"  # before any thread starts, which a fork would lose
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import nsm.pipeline  # noqa: F401  imported once, for all processes
+import nsm.pipeline  # noqa: F401  imported once for all processes
 from nsm import cli
 from nsm.pipeline.folder_lock import LOCK_FILE
 from torture import check
@@ -37,8 +37,8 @@ from torture.shapes import REFUSED, SOLVED
 
 RESULT = Path(__file__).parents[1] / "results" / "torture.json"
 PAGE = Path(__file__).parents[2] / "docs" / "robustness.md"
-SECONDS = 300  # of a processor, a case
-SLACK = 5  # times these, on a machine that is busy: then it hangs
+SECONDS = 300  # of processor time per case
+SLACK = 5  # a case hangs if it takes this many times longer on the clock
 SECONDS_OF_MILLION = 1200
 MEMORY = 6 * 2**30  # bytes of address space
 SHARED = {
@@ -52,7 +52,7 @@ FAILED = "failed"
 
 @dataclass
 class Trial:
-    """A case on its way: its folder, and the process that runs it."""
+    """A running case: its folder and process."""
 
     case: Case
     seconds: int
@@ -63,18 +63,18 @@ class Trial:
         if self.case.around:
             self.place.enter_context(self.case.around(self.folder))
         words = self.case.prepare(self.folder)
-        self.said, self.told = (
+        self.stdout, self.stderr = (
             self.place.enter_context((self.folder / name).open("w+", errors="replace"))
-            for name in (".said", ".told")
+            for name in (".stdout", ".stderr")
         )
         self.before = _files(self.folder)
         self.started = time.monotonic()
         self.process = os.fork()
         if self.process == 0:
-            _be_the_command(self, words)
+            _run_command(self, words)
 
     def result(self) -> dict[str, Any] | None:
-        """What came of it; None while it runs."""
+        """The outcome; None while the case runs."""
         done, status, used = os.wait4(self.process, os.WNOHANG)
         spent = time.monotonic() - self.started
         if not done and spent < SLACK * self.seconds:
@@ -85,12 +85,12 @@ class Trial:
             used = os.wait4(self.process, 0)[2]
             outcome, reason, complaints = FAILED, "", [f"not done after {spent:.0f} s"]
         else:
-            for stream in (self.told, self.said):
+            for stream in (self.stderr, self.stdout):
                 stream.seek(0)
             code = os.waitstatus_to_exitcode(status)
             left = _files(self.folder) - self.before
-            outcome, reason, complaints = _judged(
-                case, code, self.said.read(), self.told.read(), self.folder, left
+            outcome, reason, complaints = _judge(
+                case, code, self.stdout.read(), self.stderr.read(), self.folder, left
             )
             if outcome != case.expected or case.reason not in reason:
                 complaints.append(f"expected: {case.expected} {case.reason}".strip())
@@ -108,11 +108,11 @@ class Trial:
         }
 
 
-def _be_the_command(trial: Trial, words: Sequence[str]) -> NoReturn:
-    """Become ``nsm WORDS``, in the trial's folder and within its limits; never come back."""
-    os.dup2(trial.said.fileno(), 1)
-    os.dup2(trial.told.fileno(), 2)
-    # whoever forked may have put others in their place
+def _run_command(trial: Trial, words: Sequence[str]) -> NoReturn:
+    """Run ``nsm WORDS`` in the trial's folder, within its limits, and exit."""
+    os.dup2(trial.stdout.fileno(), 1)
+    os.dup2(trial.stderr.fileno(), 2)
+    # the parent process may have replaced them
     sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
     status = 1
     try:
@@ -135,13 +135,13 @@ def _be_the_command(trial: Trial, words: Sequence[str]) -> NoReturn:
             os._exit(status)
 
 
-def _judged(
-    case: Case, status: int, said: str, told: str, folder: Path, left: set[Path]
+def _judge(
+    case: Case, status: int, stdout: str, stderr: str, folder: Path, left: set[Path]
 ) -> tuple[str, str, list[str]]:
-    """Outcome, reason of a refusal, and complaints."""
-    lines = told.strip().splitlines()
+    """The outcome, the message of a refusal, and complaints."""
+    lines = stderr.strip().splitlines()
     complaints = []
-    if "Traceback" in said + told:
+    if "Traceback" in stdout + stderr:
         complaints.append("a traceback: " + (lines[-1] if lines else ""))
     if status == 0:
         if lines:
@@ -164,10 +164,9 @@ def _judged(
 
 
 def _is_result(file: Path) -> bool:
-    """Whether a file pretends that something was finished.
+    """Whether a file suggests a finished run.
 
-    A training that was under way when the disk became full keeps its settings and its checkpoint,
-    to go on from.
+    A training interrupted by a full disk keeps its settings and its checkpoint, to be resumed.
     """
     kept = file.name in ("config.yaml", "last.ckpt", LOCK_FILE) or "tensorboard" in file.parts
     return "cache" not in file.parts and not kept
@@ -177,8 +176,8 @@ def _files(folder: Path) -> set[Path]:
     return {p for p in folder.rglob("*") if p.is_file() and not p.is_symlink()}
 
 
-def _shared(folder: Path) -> Iterator[tuple[Case, int]]:
-    """The classic models, where they are at hand."""
+def _classic_models(folder: Path) -> Iterator[tuple[Case, int]]:
+    """The classic models in a folder, with their limits of time."""
     for name, seconds in SHARED.items():
         file = folder / name
         if file.is_file():
@@ -187,7 +186,7 @@ def _shared(folder: Path) -> Iterator[tuple[Case, int]]:
 
 
 def table(results: Sequence[dict[str, Any]]) -> str:
-    """Counts by group, as a Markdown table, with the reasons of refusals."""
+    """The counts of outcomes by group, as a Markdown table."""
     lines = ["| what | tried | solved | refused | failed |", "|---|---|---|---|---|"]
     groups = list(dict.fromkeys(r["group"] for r in results))
     for group in [*groups, None]:
@@ -199,19 +198,21 @@ def table(results: Sequence[dict[str, Any]]) -> str:
 
 
 def reasons(results: Sequence[dict[str, Any]]) -> str:
-    """What each refused case was told, as a Markdown table."""
-    lines = ["| case | told |", "|---|---|"]
+    """The messages of refused cases, as a Markdown table."""
+    lines = ["| case | message |", "|---|---|"]
     for r in results:
         if r["outcome"] == REFUSED:
-            told = r["reason"].replace("|", "\\|").replace("<", "&lt;")
-            lines.append(f"| {r['case']} | {told} |")
+            message = r["reason"].replace("|", "\\|").replace("<", "&lt;")
+            lines.append(f"| {r['case']} | {message} |")
     return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", nargs="*", help="words, one of which a case's name must have")
-    parser.add_argument("--skip", nargs="*", default=(), help="words that no case's name may have")
+    parser.add_argument("--only", nargs="*", help="words, one of which a case's name must contain")
+    parser.add_argument(
+        "--skip", nargs="*", default=(), help="words that a case's name must not contain"
+    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--meshes", type=Path, default=Path("../shared/meshes"))
     options = parser.parse_args()
@@ -221,15 +222,15 @@ def main() -> None:
         for case in all_cases()
         if mounts or case.around is None
     ]
-    every += _shared(options.meshes.resolve())
+    every += _classic_models(options.meshes.resolve())
     chosen = [
         (case, seconds)
         for case, seconds in every
-        if (not options.only or _has_one(case, options.only)) and not _has_one(case, options.skip)
+        if (not options.only or _matches(case, options.only)) and not _matches(case, options.skip)
     ]
     kept = _kept()
     failed = []
-    for result in _tried(chosen, options.jobs):
+    for result in _run_all(chosen, options.jobs):
         print(_line(result), flush=True)
         kept[result["group"], result["case"]] = result
         if result["outcome"] == FAILED:
@@ -238,7 +239,7 @@ def main() -> None:
 
     names = [(case.group, case.name) for case, _ in every]
     missing = [name for name in names if name not in kept]
-    # those of another machine, with meshes that are not at hand here, stand behind
+    # cases of meshes that this machine lacks come last
     ordered = {name: kept[name] for name in [*names, *kept] if name in kept}
     results = list(ordered.values())
     _keep(ordered, mounts)
@@ -246,19 +247,19 @@ def main() -> None:
     for result in failed:
         print(f"failed: {_line(result)}")
     if missing:
-        print(f"{len(missing)} cases have not been tried yet")
+        print(f"{len(missing)} cases have not been run yet")
     else:
         RESULT.with_suffix(".md").write_text(f"{table(results)}\n\n{reasons(results)}\n")
-        _show(table(results))
+        _write_table(table(results))
     sys.exit(1 if failed else 0)
 
 
-def _has_one(case: Case, words: Sequence[str]) -> bool:
+def _matches(case: Case, words: Sequence[str]) -> bool:
     return any(word in f"{case.group}: {case.name}" for word in words)
 
 
-def _tried(todo: Sequence[tuple[Case, int]], jobs: int) -> Iterator[dict[str, Any]]:
-    """Run cases, so many at a time, and give what came of each."""
+def _run_all(todo: Sequence[tuple[Case, int]], jobs: int) -> Iterator[dict[str, Any]]:
+    """Run cases, ``jobs`` at a time, and give the outcome of each."""
     queue = list(todo)[::-1]
     running: list[Trial] = []
     while queue or running:
@@ -279,14 +280,14 @@ def _line(result: dict[str, Any]) -> str:
 
 
 def _kept() -> dict[tuple[str, str], dict[str, Any]]:
-    """What came of cases before, by group and name."""
+    """The stored outcomes by group and name."""
     if not RESULT.exists():
         return {}
     return {(r["group"], r["case"]): r for r in json.loads(RESULT.read_text())["cases"]}
 
 
 def _keep(results: Mapping[tuple[str, str], dict[str, Any]], mounts: bool) -> None:
-    words = {
+    content = {
         "limits": {
             "seconds": SECONDS,
             "seconds_of_a_million_faces": SECONDS_OF_MILLION,
@@ -295,11 +296,11 @@ def _keep(results: Mapping[tuple[str, str], dict[str, Any]], mounts: bool) -> No
         "disks_mounted": mounts,
         "cases": list(results.values()),
     }
-    RESULT.write_text(json.dumps(words, indent=1, ensure_ascii=False) + "\n")
+    RESULT.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
-def _show(text: str) -> None:
-    """Put the table into its place in the documentation."""
+def _write_table(text: str) -> None:
+    """Write the table into the documentation."""
     before, mark, rest = PAGE.read_text().partition("<!-- table -->\n")
     after = rest.partition("<!-- end -->")[1:]
     PAGE.write_text(before + mark + "\n" + text + "\n\n" + "".join(after))

@@ -1,4 +1,4 @@
-"""What is tried: words of the command line beside what they need, and what is to come of them."""
+"""The cases: command lines, the files that they need, and the expected outcomes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from torture import files, shapes
 from torture.shapes import REFUSED, SOLVED, Mesh
 
-# a training long enough to come near, short enough for many
+# long enough to approach the mesh, short enough for many cases
 OVERFIT = (
     "experiment=quick",
     "trainer.max_steps=200",
@@ -30,10 +30,9 @@ MAP = (
     "logger=none",
 )
 PHI = "phi.overrides=['experiment=quick','trainer.max_steps=200']"
-BARE = ("artefacts=false",)  # of most: pictures take longer than all the rest
+BARE = ("artefacts=false",)  # for most cases: pictures take most of the time
 PICTURED = ("genus 2", "needles 1e-9", "one triangle", "spike 1e7", "scale 1e-25", "slit")
-# all but a line, or folded everywhere: the few steps and the coarse grid of the others would reach
-# a part of it
+# nearly a line, or folded everywhere: these need more steps and a finer grid than the others
 LONGER = ("triangles 1e6 : 1", "triangles 1e9 : 1", "spike 1e7", "strip of 2000", "crumpled torus")
 LONG = ("trainer.max_steps=1000", "encoding.resolutions=[32,128,512]")
 SQUARE_TOO = ("genus 3", "10 boundary loops", "needles 1e-6", "open fan of 200", "spike 10")
@@ -43,8 +42,16 @@ SQUARE_TOO = ("genus 3", "10 boundary loops", "needles 1e-6", "open fan of 200",
 class Case:
     """One command.
 
-    prepare writes what it needs into its folder, and returns its words; limit is the size in
-    bytes beyond which it may write no file; around prepares the folder itself (a full disk).
+    Attributes:
+        group, name: of the case.
+        prepare: writes the files that it needs into a folder, and returns the command's words.
+        expected: SOLVED or REFUSED.
+        reason: a part of the message of a refusal.
+        task: of the command.
+        mesh: the mesh of the surface, if the result is to be compared with it.
+        limit: largest size in bytes of a file that it may write.
+        environment: additional variables.
+        around: a context manager that prepares the folder (a full disk).
     """
 
     group: str
@@ -60,7 +67,7 @@ class Case:
 
 
 def quoted(value: str) -> str:
-    """A word as a setting's value on the command line, whatever is in it."""
+    """A text quoted as the value of a setting on the command line."""
     for old, new in (("\\", "\\\\"), ('"', '\\"'), ("${", "\\${")):
         value = value.replace(old, new)
     return f'"{value}"'
@@ -96,7 +103,7 @@ def _param(make: Callable[[], Mesh], folder: Path) -> list[str]:
 
 @contextmanager
 def _small_disk(size: str, folder: Path) -> Iterator[None]:
-    """A disk of its own under ``disk``; left out where it may not be mounted."""
+    """Mount a small disk at ``disk``."""
     (folder / "disk").mkdir()
     subprocess.run(
         ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", "disk"], cwd=folder, check=True
@@ -214,8 +221,7 @@ def all_cases() -> list[Case]:
 
 
 def limits(memory: int, seconds: int, file_size: int | None) -> None:
-    """Set this process's limits: bytes of address space, seconds of processor time, and bytes of
-    any file that it writes."""
+    """Limit this process: bytes of address space, seconds of processor time, bytes per file."""
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 10))
     if file_size is not None:

@@ -1,4 +1,4 @@
-"""What a run leaves, looked at from outside: is it whole, finite, injective and near the mesh?"""
+"""Checks of the files of a run: are they complete, finite, injective and near the mesh?"""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from safetensors.numpy import load_file
 import nsm
 from nsm.pipeline.folder_lock import LOCK_FILE
 
-# φ after the few steps of a trial may be this far from the mesh, in percent of the diagonal (RMS)
+# largest RMS distance of φ from the mesh after the few steps of a case, in percent of the diagonal
 NEAR_PERCENT = 15.0
 _ROUNDING = 1e-9
-# of a map's network, which computes in single precision
+# for maps, whose networks compute in single precision
 _SINGLE = 1e-6
-# of twice an area within Ω, in double precision: what is smaller is computed anew, in fractions
+# twice an area in Ω: smaller ones are recomputed in rational numbers
 _UNSURE = 1e-14
 
 
 def complaints(folder: Path, task: str, mesh: tuple[np.ndarray, np.ndarray]) -> list[str]:
-    """Everything that is wrong with the folder of a finished run; nothing if it is right."""
+    """Everything that is wrong in the folder of a finished run."""
     found = [*_files(folder)]
     if not (folder / "metrics.json").exists():
         return [*found, "no metrics.json"]
@@ -45,15 +45,15 @@ def complaints(folder: Path, task: str, mesh: tuple[np.ndarray, np.ndarray]) -> 
 
 
 def _files(folder: Path) -> Iterator[str]:
-    """Files that are half written, or that hold values which are not finite."""
+    """Complaints about incomplete files and values that are not finite."""
     for file in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != LOCK_FILE):
         name = file.relative_to(folder)
         if file.suffix == ".tmp" or file.stat().st_size == 0:
-            yield f"{name}: half written"
+            yield f"{name}: incomplete"
             continue
         try:
             arrays = _arrays(file)
-        except Exception as error:  # whatever the readers of ten formats raise
+        except Exception as error:  # the readers of ten formats raise any exception
             yield f"{name}: unreadable ({type(error).__name__}: {error})"
             continue
         for array in arrays:
@@ -83,18 +83,18 @@ def _arrays(file: Path) -> list[np.ndarray]:
     return []
 
 
-def _numbers(words: Any) -> list[float]:
-    """All numbers of a JSON file; null, which stands for a figure that is no number, as NaN.
+def _numbers(content: Any) -> list[float]:
+    """All numbers of a JSON file, with null, which stands for NaN, as NaN.
 
-    Settings may well be null: they are left out.
+    Settings, which may be null, are left out.
     """
-    if isinstance(words, dict):
-        return [x for key, value in words.items() if key != "config" for x in _numbers(value)]
-    if isinstance(words, list):
-        return [x for value in words for x in _numbers(value)]
-    if words is None:
+    if isinstance(content, dict):
+        return [x for key, value in content.items() if key != "config" for x in _numbers(value)]
+    if isinstance(content, list):
+        return [x for value in content for x in _numbers(value)]
+    if content is None:
         return [math.nan]
-    return [float(words)] if isinstance(words, (int, float)) else []
+    return [float(content)] if isinstance(content, (int, float)) else []
 
 
 def _tensors(state: Any) -> Iterator[np.ndarray]:
@@ -109,18 +109,18 @@ def _tensors(state: Any) -> Iterator[np.ndarray]:
 
 
 def _surface(folder: Path, mesh: tuple[np.ndarray, np.ndarray] | None) -> Iterator[str]:
-    """Whether a saved surface is a disc, injective in Ω, and made of the vertices of the mesh."""
+    """Complaints unless a saved surface is a disc, injective in Ω, with the mesh's vertices."""
     arrays = load_file(folder / "surface.safetensors")
-    words = json.loads((folder / "surface.json").read_text())
-    about, closed_form = words["surface"], "name" in words["map"]
+    metadata = json.loads((folder / "surface.json").read_text())
+    about, analytic = metadata["surface"], "width" not in metadata["map"]
     faces, uv, vertices = (arrays[f"surface.{key}"] for key in ("faces", "uv", "vertices"))
     area = math.pi if about["domain"] == "disc" else 4.0
     yield from disc(faces)
     yield from injective(faces, uv, about["domain"])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     total = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-    # the triangles within a closed form are smaller than it
-    if not math.isclose(total, area, rel_tol=1e-3 if closed_form else 1e-6):
+    # triangles inscribed in an analytic surface have a smaller area
+    if not math.isclose(total, area, rel_tol=1e-3 if analytic else 1e-6):
         yield f"its area is {total}, not that of the domain"
     if mesh is not None:
         source = arrays["surface.source_vertex"]
@@ -133,38 +133,37 @@ def _surface(folder: Path, mesh: tuple[np.ndarray, np.ndarray] | None) -> Iterat
 
 
 def disc(faces: np.ndarray) -> Iterator[str]:
-    """Complaints unless the triangles are an oriented disc: one piece, one boundary, no handle."""
+    """Complaints unless the mesh is an oriented disc: one component, one boundary loop, genus 0."""
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     if len(np.unique(directed, axis=0)) != len(directed):
-        yield "an edge is run along twice in one direction"
+        yield "two faces use an edge in the same direction"
         return
     edges, count = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
     euler = len(np.unique(faces)) - len(edges) + len(faces)
     if euler != 1 or count.max() > 2:
         yield f"Euler characteristic {euler}, not that of a disc"
     if trimesh.graph.connected_component_labels(edges).max() != 0:
-        yield "more than one piece"
-    rim = boundary(faces)
-    if rim is None:
+        yield "more than one connected component"
+    if boundary(faces) is None:
         yield "its boundary is not one loop"
 
 
 def boundary(faces: np.ndarray) -> np.ndarray | None:
-    """The boundary vertices in order; None unless they are one loop that meets each once."""
+    """The boundary vertices in order; None unless they are one simple loop."""
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     key = np.sort(directed, axis=1)
     _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    rim = directed[count[inverse.ravel()] == 1]
-    following = dict(rim.tolist())
-    if len(following) != len(rim) or not following:
+    sides = directed[count[inverse.ravel()] == 1]
+    following = dict(sides.tolist())
+    if len(following) != len(sides) or not following:
         return None
     start = next(iter(following))
     loop = [start]
     while (vertex := following[loop[-1]]) != start:
         loop.append(vertex)
-        if len(loop) > len(rim):
+        if len(loop) > len(sides):
             return None
-    return np.array(loop) if len(loop) == len(rim) else None
+    return np.array(loop) if len(loop) == len(sides) else None
 
 
 def injective(
@@ -172,8 +171,8 @@ def injective(
 ) -> Iterator[str]:
     """Complaints unless uv maps a disc injectively into Ω.
 
-    It does if all triangles are counter-clockwise and the boundary goes once around ∂Ω, which is
-    convex, without turning back.
+    It does if all triangles are counter-clockwise and the boundary runs monotonically once around
+    ∂Ω, which is convex.
     """
     folded = _folded(faces, uv)
     if folded:
@@ -185,7 +184,7 @@ def injective(
     if loop is None:
         return
     if np.abs(reach[loop] - 1).max() > rounding:
-        yield "the boundary is not on that of the domain"
+        yield "the boundary is not on the boundary of the domain"
     p = uv[loop]
     q = np.roll(p, -1, axis=0)
     turn = np.arctan2(_double_areas(p, q, np.zeros_like(p)), (p * q).sum(axis=1))
@@ -199,18 +198,18 @@ def _folded(faces: np.ndarray, uv: np.ndarray) -> int:
 
 
 def _double_areas(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Twice the signed areas (N,) of triangles abc within Ω, with the right signs."""
+    """Twice the signed areas (N,) of triangles abc in Ω, with exact signs."""
     double = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     for k in np.flatnonzero(np.abs(double) < _UNSURE).tolist():
         (x, y), (s, t), (u, v) = ([Fraction(float(z)) for z in p[k]] for p in (a, b, c))
         exact = (s - x) * (v - y) - (t - y) * (u - x)
-        # the least number stands for what is smaller
+        # the least positive number represents all smaller ones
         double[k] = float(exact) or math.copysign(5e-324, exact) if exact else 0.0
     return double
 
 
 def _reconstruction(folder: Path) -> Iterator[str]:
-    """Whether φ, given back by what was saved, is near the mesh, in percent of its diagonal."""
+    """Complaints unless the loaded φ is near the mesh."""
     phi = nsm.load(folder)
     arrays = load_file(folder / "surface.safetensors")
     points, vertices = phi(arrays["surface.uv"]), arrays["surface.vertices"]
@@ -226,8 +225,7 @@ def _reconstruction(folder: Path) -> Iterator[str]:
 
 
 def _map(folder: Path, task: str) -> Iterator[str]:
-    """Whether a map onto Ω, as it is given back and in the file with its coordinates, is injective
-    where it is said to be, and not where it is said not to be."""
+    """Complaints unless a map onto Ω, loaded and in its OBJ file, is injective as certified."""
     certified = json.loads((folder / "metrics.json").read_text())["certified"]
     source, name = (
         (folder, "parameterized")
@@ -240,7 +238,7 @@ def _map(folder: Path, task: str) -> Iterator[str]:
     image = result.uv if task == "param" else result.image_uv
     found = list(injective(faces, image, domain, _SINGLE))
     if certified:
-        yield from (f"certified, but {words}" for words in found)
+        yield from (f"certified, but {complaint}" for complaint in found)
         folded = _folded(faces, _coordinates(folder / f"{name}.obj"))
         if folded:
             yield f"certified, but {folded} triangles of {name}.obj are folded"

@@ -1,6 +1,6 @@
-"""Files that are hard to bear: damaged, lying, oddly named, or not files at all.
+"""Difficult files: damaged, with wrong headers, with unusual names, or not regular files.
 
-Each maker writes into an empty folder and returns the path for the command line.
+Each function writes into an empty folder and returns the path for the command line.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FORMATS = ("obj", "off", "ply", "binary.ply", "stl", "binary.stl", "gltf", "glb"
 
 @dataclass(frozen=True)
 class File:
-    """A file to be made, and what is to come of it."""
+    """A file, the expected outcome, and a part of the message of a refusal."""
 
     group: str
     make: Callable[[Path], str]
@@ -34,14 +34,14 @@ class File:
 
 
 def write(mesh: Mesh, path: Path) -> None:
-    """A mesh as OBJ, with all digits."""
+    """Write a mesh as OBJ, with all digits."""
     lines = [f"v {x!r} {y!r} {z!r}\n" for x, y, z in mesh[0].tolist()]
     lines += [f"f {a} {b} {c}\n" for a, b, c in (mesh[1] + 1).tolist()]
     path.write_text("".join(lines))
 
 
 def exported(mesh: Mesh, form: str) -> bytes:
-    """A mesh in one of FORMATS."""
+    """The bytes of a mesh in one of FORMATS."""
     whole = trimesh.Trimesh(*mesh, process=False)
     if form == "ply":
         return whole.export(file_type="ply", encoding="ascii")
@@ -54,7 +54,7 @@ def exported(mesh: Mesh, form: str) -> bytes:
 
 
 def gltf(mesh: Mesh, **changes: object) -> bytes:
-    """A mesh as one GLTF file, its buffer within; changes replace entries by ``place__key``."""
+    """A mesh as one GLTF file with its buffer; changes replace entries, by ``array__key``."""
     points = mesh[0].astype("<f4")
     index = mesh[1].astype("<u4")
     data = points.tobytes() + index.tobytes()
@@ -80,8 +80,8 @@ def gltf(mesh: Mesh, **changes: object) -> bytes:
         ],
     }
     for name, value in changes.items():
-        place, key = name.split("__")
-        tree[place][0][key] = value
+        array, key = name.split("__")
+        tree[array][0][key] = value
     return json.dumps(tree).encode()
 
 
@@ -100,7 +100,7 @@ def _whole(form: str, folder: Path) -> str:
 
 def _part(form: str, share: float, folder: Path) -> str:
     data = exported(ball(8), form)
-    # not within the last face: a text file that ends in a shorter number is whole to any reader
+    # not inside the last number: a text file that ends in a shorter number looks complete
     return _raw(_name(form), data[: int(share * len(data))], folder)
 
 
@@ -113,7 +113,7 @@ def _with_value(form: str, value: float, folder: Path) -> str:
 LETTER = b"Dear reader,\nthis is no mesh, but 3 4 5 numbers are in it.\nf 1 2 3\nYours, v\n"
 
 
-def _ply_that_lies(vertices: int, faces: int, form: str, folder: Path) -> str:
+def _wrong_ply(vertices: int, faces: int, form: str, folder: Path) -> str:
     head = (
         f"ply\nformat {form} 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\n"
         f"property float z\nelement face {faces}\nproperty list uchar int vertex_indices\n"
@@ -132,15 +132,15 @@ def _ply_with_long_list(folder: Path) -> str:
     return _raw("list.ply", head.encode() + body, folder)
 
 
-def _stl_that_lies(folder: Path) -> str:
+def _wrong_stl(folder: Path) -> str:
     return _raw("lies.stl", b"\0" * 80 + struct.pack("<I", 2**32 - 1) + b"\0" * 50, folder)
 
 
-def _off_that_lies(vertices: int, faces: int, folder: Path) -> str:
+def _wrong_off(vertices: int, faces: int, folder: Path) -> str:
     return _raw("lies.off", f"OFF\n{vertices} {faces} 0\n0 0 0\n1 0 0\n".encode(), folder)
 
 
-def _glb_that_lies(folder: Path) -> str:
+def _wrong_glb(folder: Path) -> str:
     data = bytearray(exported(ball(8), "glb"))
     data[12:16] = struct.pack("<I", 2**32 - 16)
     return _raw("lies.glb", bytes(data), folder)
@@ -150,29 +150,15 @@ def _gltf_changed(folder: Path, **changes: object) -> str:
     return _raw("changed.gltf", gltf(ball(8), **changes), folder)
 
 
-def _gltf_with_count(folder: Path) -> str:
-    accessors = json.loads(gltf(ball(8)))["accessors"]
-    accessors[0]["count"] = 2**40
-    tree = json.loads(gltf(ball(8)))
-    tree["accessors"] = accessors
-    return _raw("count.gltf", json.dumps(tree).encode(), folder)
-
-
-def _gltf_of_nothing(folder: Path) -> str:
-    """An accessor without a buffer view stands for zeros, as many as it says."""
+def _gltf_of_zeros(folder: Path) -> str:
+    """An accessor without a buffer view stands for any number of zeros."""
     tree = json.loads(gltf(ball(8)))
     tree["accessors"][0] = {"componentType": 5126, "count": 2**40, "type": "VEC3"}
     return _raw("zeros.gltf", json.dumps(tree).encode(), folder)
 
 
-def _gltf_with_loop(folder: Path) -> str:
-    tree = json.loads(gltf(ball(8)))
-    tree["nodes"][0]["children"] = [0]
-    return _raw("loop.gltf", json.dumps(tree).encode(), folder)
-
-
 def _gltf_with_many_copies(folder: Path) -> str:
-    """Ten nodes of ten children each, eight deep: a hundred million copies of one mesh."""
+    """Eight levels of ten children each: a hundred million copies of one mesh."""
     tree = json.loads(gltf(ball(8)))
     tree["nodes"] = [{"children": [k + 1] * 10} for k in range(8)] + [{"mesh": 0}]
     return _raw("copies.gltf", json.dumps(tree).encode(), folder)
@@ -186,15 +172,15 @@ def _gltf_with_outer_file(uri: str, folder: Path) -> str:
     return _raw("inner/outer.gltf", json.dumps(tree).encode(), folder)
 
 
-def _packed(folder: Path) -> str:
+def _gzipped(folder: Path) -> str:
     return _raw("packed.obj", gzip.compress(exported(ball(8), "obj")), folder)
 
 
-def _wide(encoding: str, folder: Path) -> str:
+def _encoded(encoding: str, folder: Path) -> str:
     return _raw("wide.obj", exported(ball(8), "obj").decode().encode(encoding), folder)
 
 
-def _with_mark(folder: Path) -> str:
+def _with_byte_order_mark(folder: Path) -> str:
     return _raw("mark.off", b"\xef\xbb\xbf" + exported(ball(8), "off"), folder)
 
 
@@ -257,29 +243,33 @@ FILES: dict[str, File] = {
         for word in ("nan", "inf")
     },
     "PLY of 2e9 vertices, binary": File(
-        "headers that lie", partial(_ply_that_lies, 2 * 10**9, 1, "binary_little_endian")
+        "headers that lie", partial(_wrong_ply, 2 * 10**9, 1, "binary_little_endian")
     ),
     "PLY of 2e9 vertices, ascii": File(
-        "headers that lie", partial(_ply_that_lies, 2 * 10**9, 1, "ascii")
+        "headers that lie", partial(_wrong_ply, 2 * 10**9, 1, "ascii")
     ),
     "PLY of 1e18 faces": File(
-        "headers that lie", partial(_ply_that_lies, 3, 10**18, "binary_little_endian")
+        "headers that lie", partial(_wrong_ply, 3, 10**18, "binary_little_endian")
     ),
-    "PLY of -1 vertices": File("headers that lie", partial(_ply_that_lies, -1, 1, "ascii")),
+    "PLY of -1 vertices": File("headers that lie", partial(_wrong_ply, -1, 1, "ascii")),
     "PLY face of 4e9 corners": File("headers that lie", _ply_with_long_list),
-    "STL of 4e9 faces": File("headers that lie", _stl_that_lies),
-    "OFF of 1e12 vertices": File("headers that lie", partial(_off_that_lies, 10**12, 10)),
-    "OFF of -3 vertices": File("headers that lie", partial(_off_that_lies, -3, -2)),
-    "GLB chunk of 4 GB": File("headers that lie", _glb_that_lies),
-    "GLTF accessor of 1e12": File("headers that lie", _gltf_with_count),
-    "GLTF accessor of 1e12 zeros": File("headers that lie", _gltf_of_nothing),
+    "STL of 4e9 faces": File("headers that lie", _wrong_stl),
+    "OFF of 1e12 vertices": File("headers that lie", partial(_wrong_off, 10**12, 10)),
+    "OFF of -3 vertices": File("headers that lie", partial(_wrong_off, -3, -2)),
+    "GLB chunk of 4 GB": File("headers that lie", _wrong_glb),
+    "GLTF accessor of 1e12": File(
+        "headers that lie", partial(_gltf_changed, accessors__count=2**40)
+    ),
+    "GLTF accessor of 1e12 zeros": File("headers that lie", _gltf_of_zeros),
     "GLTF view beyond its buffer": File(
         "headers that lie", partial(_gltf_changed, bufferViews__byteOffset=10**9)
     ),
     "GLTF buffer that is missing": File(
         "headers that lie", partial(_gltf_changed, buffers__uri="not-there.bin")
     ),
-    "GLTF node within itself": File("headers that lie", _gltf_with_loop),
+    "GLTF node within itself": File(
+        "headers that lie", partial(_gltf_changed, nodes__children=[0])
+    ),
     "GLTF of 1e8 copies": File("headers that lie", _gltf_with_many_copies),
     "GLTF buffer ../secret.bin": File(
         "outer files", partial(_gltf_with_outer_file, "../secret.bin")
@@ -293,10 +283,10 @@ FILES: dict[str, File] = {
     "GLTF buffer http://": File(
         "outer files", partial(_gltf_with_outer_file, "http://127.0.0.1:9/secret.bin")
     ),
-    "OBJ, gzipped": File("encodings", _packed),
-    "OBJ in UTF-16": File("encodings", partial(_wide, "utf-16")),
-    "OBJ in EBCDIC": File("encodings", partial(_wide, "cp037")),
-    "OFF with a byte order mark": File("encodings", _with_mark, SOLVED),
+    "OBJ, gzipped": File("encodings", _gzipped),
+    "OBJ in UTF-16": File("encodings", partial(_encoded, "utf-16")),
+    "OBJ in EBCDIC": File("encodings", partial(_encoded, "cp037")),
+    "OFF with a byte order mark": File("encodings", _with_byte_order_mark, SOLVED),
     "polygon of 5000 corners": File("polygons", partial(_polygon, 5000), SOLVED),
     "polygon of 2 corners": File("polygons", partial(_faces, "f 1 2")),
     "polygon of one vertex": File("polygons", partial(_faces, "f 1 1 1 1"), SOLVED),

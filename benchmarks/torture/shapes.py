@@ -1,6 +1,6 @@
-"""Surfaces that are hard to bear, each made by a function: vertices (V, 3) and triangles (F, 3).
+"""Difficult surfaces, one function each: vertices (V, 3) and triangles (F, 3).
 
-Nothing here comes from nsm, so that its errors cannot hide in what it is tried on.
+Nothing here uses nsm, so that an error of nsm cannot affect the input.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SOLVED, REFUSED = "solved", "refused"
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh, what is to come of it, and, if it is to be refused, a word of the reason."""
+    """A mesh, the expected outcome, and a part of the message of a refusal."""
 
     group: str
     make: Callable[[], Mesh]
@@ -30,7 +30,7 @@ class Shape:
 
 
 def grid(rows: int, columns: int, *, wrap_rows: bool = False, wrap_columns: bool = False) -> Mesh:
-    """Points (i, j, 0) of a grid, and its triangles; a wrapped direction closes on itself."""
+    """Points (i, j, 0) of a grid, and its triangles; a wrapped direction is periodic."""
     i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     points = np.stack([i, j, np.zeros_like(i)], axis=-1).reshape(-1, 3).astype(float)
     a, b = np.meshgrid(
@@ -56,7 +56,7 @@ def bumpy(n: int = 24) -> Mesh:
 
 
 def ball(n: int = 16, radius: float = 1.0) -> Mesh:
-    """A sphere of rings, with a triangle fan at either pole; outward."""
+    """A sphere of rings with a triangle fan at each pole, oriented outwards."""
     rings, around = n, 2 * n
     polar = np.pi * np.arange(1, rings) / rings
     angle = 2 * np.pi * np.arange(around) / around
@@ -81,7 +81,7 @@ def torus(n: int = 24, tube: float = 0.4) -> Mesh:
 
 
 def joined(meshes: Iterable[Mesh]) -> Mesh:
-    """Several meshes as one, unconnected."""
+    """The union of meshes, without connecting them."""
     points, faces, count = [], [], 0
     for p, f in meshes:
         points.append(p)
@@ -91,7 +91,7 @@ def joined(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def without(mesh: Mesh, faces: np.ndarray) -> Mesh:
-    """The mesh less some faces."""
+    """The mesh without some faces."""
     return mesh[0], np.delete(mesh[1], faces, axis=0)
 
 
@@ -132,7 +132,7 @@ def stretched(ratio: float) -> Mesh:
 
 
 def needles(gap: float) -> Mesh:
-    """A ball each of whose triangles was split at a point ``gap`` away from a side."""
+    """A sphere with each triangle split at a point ``gap`` away from a side."""
     points, faces = ball(8)
     a, b, c = (points[faces[:, k]] for k in range(3))
     middle = (0.5 - gap) * a + (0.5 - gap) * b + 2 * gap * c
@@ -142,7 +142,7 @@ def needles(gap: float) -> Mesh:
 
 
 def caps() -> Mesh:
-    """A plate whose points lie at random, some all but on a line: slivers of every kind."""
+    """A plate with random vertices: slivers of every kind."""
     points, faces = bumpy(20)
     random = np.random.default_rng(1)
     inner = (points[:, :2] > 0.01).all(1) & (points[:, :2] < 0.99).all(1)
@@ -151,7 +151,7 @@ def caps() -> Mesh:
 
 
 def zero_area() -> Mesh:
-    """A plate with triangles of no area inside: edges subdivided on one side only."""
+    """A plate with degenerate triangles: edges subdivided on one side only."""
     points, faces = bumpy(12)
     random = np.random.default_rng(2)
     for f in random.choice(len(faces), 30, replace=False):
@@ -164,7 +164,7 @@ def zero_area() -> Mesh:
 
 
 def short_edges(length: float) -> Mesh:
-    """A ball some of whose vertices were pulled apart into two, ``length`` away from each other."""
+    """A sphere with some vertices split in two, ``length`` apart."""
     points, faces = ball(10)
     for v in range(25, 175, 25):
         around = np.flatnonzero((faces == v).any(axis=1))
@@ -185,7 +185,7 @@ def short_edges(length: float) -> Mesh:
 
 
 def spike(height: float) -> Mesh:
-    """A ball with one vertex pulled far out."""
+    """A sphere with one vertex far outside."""
     points, faces = ball(12)
     points[len(points) // 2] *= height
     return points, faces
@@ -199,23 +199,23 @@ def moved(mesh: Callable[[], Mesh], scale: float = 1.0, shift: float = 0.0) -> M
     return points * scale + shift * np.array([1.0, -1.0, 0.5]), faces
 
 
-# ------------------------------------------------------------------ faces twice, turned, missing
+# ------------------------------------------------------------------ duplicate and flipped faces
 
 
 def doubled() -> Mesh:
-    """Each tenth face twice, once with its corners in another order."""
+    """Each tenth face three times, once with its corners in another order."""
     points, faces = ball()
     return points, np.vstack([faces, faces[::10], faces[::10][:, [1, 2, 0]]])
 
 
 def both_ways() -> Mesh:
-    """Each face a second time, turned round: a sheet with two sides."""
+    """Each face and its mirror image."""
     points, faces = bumpy()
     return points, np.vstack([faces, faces[:, ::-1]])
 
 
 def turned(share: float) -> Mesh:
-    """A torus, a share of whose faces are turned round."""
+    """A torus with a share of its faces flipped."""
     points, faces = torus()
     random = np.random.default_rng(3)
     some = random.random(len(faces)) < share
@@ -224,14 +224,14 @@ def turned(share: float) -> Mesh:
 
 
 def isolated() -> Mesh:
-    """A plate with vertices that no face uses, and faces that are but an edge or a point."""
+    """A plate with unreferenced vertices and faces that are an edge or a point."""
     points, faces = bumpy()
     points = np.vstack([points, [[3.0, 3, 3], [4, 4, 4]]])
     n = len(points)
     return points, np.vstack([faces, [(n - 1, n - 2, n - 1), (0, 5, 0), (7, 7, 7)]])
 
 
-# ------------------------------------------------------------------ one-sided and no manifold
+# ------------------------------------------------------------------ non-orientable, non-manifold
 
 
 def moebius(n: int = 60) -> Mesh:
@@ -253,7 +253,7 @@ def moebius(n: int = 60) -> Mesh:
 
 
 def klein(n: int = 40) -> Mesh:
-    """Klein's bottle (the figure-eight immersion)."""
+    """A Klein bottle (the figure-eight immersion)."""
     points, faces = grid(n, n, wrap_columns=True)
     u, v = 2 * np.pi * points[:, 0] / n, 2 * np.pi * points[:, 1] / n
     reach = 2 + np.cos(u / 2) * np.sin(v) - np.sin(u / 2) * np.sin(2 * v)
@@ -267,7 +267,7 @@ def klein(n: int = 40) -> Mesh:
 
 
 def projective_plane() -> Mesh:
-    """The real projective plane of six vertices, crossing itself."""
+    """The real projective plane with six vertices; it intersects itself."""
     points = np.random.default_rng(4).normal(size=(6, 3))
     faces = [
         (0, 1, 4), (0, 1, 5), (0, 2, 3), (0, 2, 5), (0, 3, 4),
@@ -277,7 +277,7 @@ def projective_plane() -> Mesh:
 
 
 def book(pages: int) -> Mesh:
-    """Pages that hang on one spine: an edge of as many faces."""
+    """Triangles that share one edge."""
     angle = 2 * np.pi * np.arange(pages) / pages
     tips = np.stack([np.cos(angle), np.sin(angle), np.full(pages, 0.5)], 1)
     points = np.vstack([[[0.0, 0, 0], [0, 0, 1]], tips])
@@ -285,7 +285,7 @@ def book(pages: int) -> Mesh:
 
 
 def touching_balls() -> Mesh:
-    """Two balls with one vertex in common."""
+    """Two spheres that share one vertex."""
     (p, f), (q, g) = ball(8), ball(8)
     q = q + [0, 0, 2.0]
     south = len(q) - 2
@@ -295,14 +295,14 @@ def touching_balls() -> Mesh:
 
 
 def pinched_torus() -> Mesh:
-    """A torus two of whose vertices, far apart, are one."""
+    """A torus with two far vertices merged."""
     points, faces = torus()
     faces[faces == len(points) // 2] = 0
     return points, faces
 
 
 def chessboard() -> Mesh:
-    """A plate without its black squares: the white ones hang together by their corners."""
+    """A plate without its black squares: the white ones are connected only by corners."""
     points, faces = bumpy(13)
     cells = np.arange(144)
     black = (cells // 12 + cells % 12) % 2 == 1
@@ -313,7 +313,7 @@ def chessboard() -> Mesh:
 
 
 def holes(count: int, n: int = 36) -> Mesh:
-    """A plate with count - 1 holes in it: count boundary loops."""
+    """A plate with count - 1 holes, that is, count boundary loops."""
     points, faces = bumpy(n)
     side = int(np.ceil(np.sqrt(max(count - 1, 1))))
     step = (n - 1) / (side + 1)
@@ -325,13 +325,13 @@ def holes(count: int, n: int = 36) -> Mesh:
 
 
 def ball_with_pinholes(count: int) -> Mesh:
-    """A ball that lacks single triangles, each a boundary loop of three edges."""
+    """A sphere without single triangles: boundary loops of three edges."""
     points, faces = ball(24)
     return without((points, faces), np.linspace(0, len(faces) - 1, count).astype(int))
 
 
 def handles(genus: int) -> Mesh:
-    """A slab of cubes with ``genus`` shafts through it."""
+    """A slab of cubes with ``genus`` shafts."""
     solid = np.ones((4 * genus + 3, 7, 3), dtype=bool)
     for k in range(genus):
         solid[4 * k + 2 : 4 * k + 5, 2:5, :] = False
@@ -345,16 +345,16 @@ def handles_and_holes() -> Mesh:
     return without((points, faces), np.array([0, 40, 90]))
 
 
-# ------------------------------------------------------------------ parts
+# ------------------------------------------------------------------ connected components
 
 
 def parts(count: int, size: float) -> Mesh:
-    """A ball, and count - 1 of the given size beside it."""
+    """A sphere, and count - 1 more of the given size."""
     small = [(size * p + [3 * (k + 1), 0, 0], f) for k in range(count - 1) for p, f in [ball(5)]]
     return joined([ball(16), *small])
 
 
-# ------------------------------------------------------------------ few faces, odd forms
+# ------------------------------------------------------------------ few faces, unusual shapes
 
 
 def one_triangle() -> Mesh:
@@ -368,17 +368,17 @@ def two_triangles() -> Mesh:
 
 
 def fan(count: int, whole: bool = False) -> Mesh:
-    """Triangles around one vertex; open, that vertex is on the boundary."""
+    """Triangles around one vertex; if not whole, it is on the boundary."""
     angle = (2 if whole else 1.7) * np.pi * np.arange(count + (not whole)) / count
-    rim = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.cos(3 * angle)], 1)
+    outer = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.cos(3 * angle)], 1)
     k = np.arange(count)
-    return np.vstack([[[0.0, 0, 0]], rim]), np.stack(
-        [np.zeros(count, int), 1 + k, 1 + (k + 1) % len(rim)], 1
+    return np.vstack([[[0.0, 0, 0]], outer]), np.stack(
+        [np.zeros(count, int), 1 + k, 1 + (k + 1) % len(outer)], 1
     )
 
 
 def strip(count: int) -> Mesh:
-    """A ribbon of triangles, all of whose vertices are on the boundary."""
+    """A strip of triangles with all vertices on the boundary."""
     points, faces = grid(count + 1, 2)
     angle = 0.2 * points[:, 0]
     radius = 5 + 0.15 * angle + points[:, 1]
@@ -393,7 +393,7 @@ def tetrahedron() -> Mesh:
 
 
 def pillow() -> Mesh:
-    """Two triangles back to back, with all three edges in common: closed, of no volume."""
+    """Two triangles that share all three edges: closed, without volume."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     return points, np.array([[0, 1, 2], [0, 2, 1]])
 
@@ -403,7 +403,7 @@ def cube() -> Mesh:
 
 
 def tube(length: int) -> Mesh:
-    """A closed tube as long as so many circumferences of six edges."""
+    """A closed tube of hexagons, ``length`` circumferences long."""
     points, faces = grid(6 * length, 6, wrap_columns=True)
     angle = 2 * np.pi * points[:, 1] / 6
     p = np.stack([np.cos(angle), np.sin(angle), points[:, 0]], 1)
@@ -416,7 +416,7 @@ def tube(length: int) -> Mesh:
 
 
 def tree(depth: int) -> Mesh:
-    """Branching thin limbs of cubes, in the plane."""
+    """Thin planar branches of cubes."""
     size = 3 * 2**depth + 1
     solid = np.zeros((size, 2 * depth * 3 + 4, 1), dtype=bool)
 
@@ -434,7 +434,7 @@ def tree(depth: int) -> Mesh:
 
 
 def slit() -> Mesh:
-    """A plate with a cut of no width through its middle, its vertices doubled."""
+    """A plate with a cut of zero width, with duplicate vertices along it."""
     points, faces = bumpy(21)
     row = [10 * 21 + j for j in range(5, 16)]
     copies = {v: len(points) + k for k, v in enumerate(row[1:-1])}
@@ -448,7 +448,7 @@ def slit() -> Mesh:
 
 
 def crumpled() -> Mesh:
-    """A torus whose vertices are thrown about at random: it crosses itself everywhere."""
+    """A torus with random vertex positions: it intersects itself everywhere."""
     points, faces = torus(10)
     return np.random.default_rng(5).normal(size=points.shape), faces
 
@@ -469,7 +469,7 @@ def million() -> Mesh:
 
 
 def million_closed() -> Mesh:
-    """A closed ball of a million triangles."""
+    """A closed surface of a million triangles."""
     points, faces = ball(501)
     return points * (1 + 0.1 * np.sin(4 * points[:, :1])), faces
 
@@ -511,20 +511,20 @@ SHAPES: dict[str, Shape] = {
     "1e6 from the origin": Shape("place", partial(moved, bumpy, 1.0, 1e6)),
     "1e8 from the origin": Shape("place", partial(moved, ball, 1.0, 1e8)),
     "1e12 from the origin": Shape("place", partial(moved, bumpy, 1.0, 1e12)),
-    "1e17 from the origin": Shape("place", partial(moved, ball, 1.0, 1e17), REFUSED, "zero area"),
+    "1e17 from the origin": Shape("place", partial(moved, ball, 1.0, 1e17), REFUSED, "degenerate"),
     "faces twice": Shape("faces", doubled),
     "faces both ways": Shape("faces", both_ways),
     "all turned round": Shape("faces", partial(turned, 1.0)),
     "half turned round": Shape("faces", partial(turned, 0.5)),
     "isolated edges and points": Shape("faces", isolated),
-    "Möbius strip": Shape("topology", moebius, REFUSED, "one-sided"),
-    "Klein bottle": Shape("topology", klein, REFUSED, "one-sided"),
-    "projective plane": Shape("topology", projective_plane, REFUSED, "one-sided"),
+    "Möbius strip": Shape("topology", moebius, REFUSED, "non-orientable"),
+    "Klein bottle": Shape("topology", klein, REFUSED, "non-orientable"),
+    "projective plane": Shape("topology", projective_plane, REFUSED, "non-orientable"),
     "book of three pages": Shape("topology", partial(book, 3), REFUSED, "non-manifold"),
     "book of two hundred pages": Shape("topology", partial(book, 200), REFUSED, "non-manifold"),
-    "two balls that touch": Shape("topology", touching_balls, REFUSED, "separate parts"),
+    "two balls that touch": Shape("topology", touching_balls, REFUSED, "connected components"),
     "pinched torus": Shape("topology", pinched_torus),
-    "chessboard": Shape("topology", chessboard, REFUSED, "separate parts"),
+    "chessboard": Shape("topology", chessboard, REFUSED, "connected components"),
     **{
         f"{k} boundary loops": Shape("boundary loops", partial(holes, k))
         for k in (2, 3, 10, 20, 50)
@@ -535,8 +535,8 @@ SHAPES: dict[str, Shape] = {
     },
     **{f"genus {k}": Shape("handles", partial(handles, k)) for k in range(1, 6)},
     "genus 2 with 3 loops": Shape("handles", handles_and_holes),
-    "two parts": Shape("parts", partial(parts, 2, 1.0), REFUSED, "separate parts"),
-    "fifty parts": Shape("parts", partial(parts, 50, 1.0), REFUSED, "separate parts"),
+    "two parts": Shape("parts", partial(parts, 2, 1.0), REFUSED, "connected components"),
+    "fifty parts": Shape("parts", partial(parts, 50, 1.0), REFUSED, "connected components"),
     "crumbs": Shape("parts", partial(parts, 40, 0.02)),
     "one triangle": Shape("few faces", one_triangle),
     "two triangles": Shape("few faces", two_triangles),
@@ -552,12 +552,12 @@ SHAPES: dict[str, Shape] = {
     "tree": Shape("odd forms", partial(tree, 4)),
     "slit": Shape("odd forms", slit),
     "crumpled torus": Shape("odd forms", crumpled),
-    "on a line": Shape("collapsed", on_a_line, REFUSED, "zero area"),
-    "at a point": Shape("collapsed", at_a_point, REFUSED, "zero area"),
+    "on a line": Shape("collapsed", on_a_line, REFUSED, "degenerate"),
+    "at a point": Shape("collapsed", at_a_point, REFUSED, "degenerate"),
     "NaN": Shape("values", partial(with_value, np.nan), REFUSED, "NaN"),
     "infinity": Shape("values", partial(with_value, np.inf), REFUSED, "infinite"),
     "one vertex at 1e300": Shape("values", partial(with_value, 1e300), REFUSED, "too large"),
-    "one vertex at 1e29": Shape("values", partial(with_value, 1e29), REFUSED, "zero area"),
+    "one vertex at 1e29": Shape("values", partial(with_value, 1e29), REFUSED, "degenerate"),
     "a million faces": Shape("size", million),
     "a million faces, closed": Shape("size", million_closed),
 }

@@ -1,42 +1,45 @@
-"""``nsm report``: one page from the results of many runs."""
+"""``nsm report``: one HTML page that compares runs."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from nsm.arguments import Arguments
+from nsm.commands import add_trust
 
 
 def main(words: list[str]) -> None:
-    """Write the page that the words of the command line ask for.
+    """Write the page for the words of the command line.
 
     Raises:
-        NsmError: a folder that is not there, folders without any run, a page that cannot be
-            written.
+        NsmError: wrong words, or as :func:`nsm.results.report.write_report`.
     """
     parser = Arguments(
         prog="nsm report",
-        description="Compare runs in one self-contained HTML page, which opens without a network: "
-        "a table of the settings that differ against the figures, learning curves, distortion "
-        "histograms, pictures side by side and 3D views that turn.",
-        epilog="Runs of different tasks may be mixed. Runs that are incomplete or damaged are "
-        "listed as such.",
+        description="Compare runs in one self-contained HTML page, which needs no network: a table "
+        "of figures and of the settings that differ, learning curves, distortion histograms, "
+        "interactive 3D views, and pictures side by side.",
+        epilog="The runs may be of different tasks. The page also lists incomplete and damaged "
+        "runs.",
     )
     parser.add_argument(
         "folders",
         nargs="+",
         metavar="FOLDER",
         type=Path,
-        help="a run folder, a sweep, or any folder above; searched for runs",
+        help="a run folder, a sweep, or a folder that contains some",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report.html"), help="default: %(default)s"
     )
     parser.add_argument("--title", default="nsm report", help="default: %(default)s")
+    add_trust(parser)
     arguments = parser.parse_args(words)
-    # torch takes seconds to import: --help and misspelt options need not wait
+    # torch takes seconds to import, which --help and wrong options do not need
     from nsm.results.report import write_report
 
-    runs, incomplete = write_report(arguments.folders, arguments.output, arguments.title)
-    aside = f", {incomplete} incomplete or damaged" if incomplete else ""
-    print(f"{runs} run{'s' if runs != 1 else ''}{aside}: {arguments.output}")
+    runs, incomplete = write_report(
+        arguments.folders, arguments.output, arguments.title, arguments.trust
+    )
+    others = f", {incomplete} incomplete or damaged" if incomplete else ""
+    print(f"{runs} run{'s' if runs != 1 else ''}{others}: {arguments.output}")

@@ -1,4 +1,4 @@
-"""Prepared surfaces kept on disk, keyed by content, so that a mesh is cut and flattened once."""
+"""Prepared surfaces on disk, keyed by content, so that each mesh is cut and flattened once."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import Any
 
 import numpy as np
 
-# Raise it when the preparation changes, so that no older result is taken for a new one.
+# Increase it when the preparation changes: entries of older versions are then ignored.
 PREPARATION_VERSION = 6
 
 
 def cache_folder() -> Path:
-    """Where prepared surfaces and fetched meshes are kept: ``NSM_CACHE``, else the user's cache."""
+    """The folder of prepared surfaces and downloaded meshes: ``NSM_CACHE``, or the user's cache."""
     import pooch
 
     return Path(os.environ.get("NSM_CACHE") or pooch.os_cache("nsm"))
 
 
 def preparation_key(vertices: np.ndarray, faces: np.ndarray, options: Mapping[str, Any]) -> str:
-    """Hash of the mesh, of how it is to be prepared, and of the preparation's version."""
+    """Hash of a mesh (V, 3), (F, 3), of the preparation's options and of its version."""
     digest = hashlib.sha256()
     digest.update(np.ascontiguousarray(vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(faces, dtype="<i8").tobytes())
@@ -33,20 +33,20 @@ def preparation_key(vertices: np.ndarray, faces: np.ndarray, options: Mapping[st
 
 
 def read(key: str) -> dict[str, np.ndarray] | None:
-    """The arrays stored under a key, or None; a damaged entry counts as none and is removed."""
+    """The arrays stored under a key, or None. A damaged entry is removed."""
     path = cache_folder() / "surfaces" / f"{key}.npz"
     if not path.exists():
         return None
     try:
         with np.load(path, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
-    except Exception:  # whatever a damaged archive raises, the surface can be made again
+    except Exception:  # a damaged archive raises any exception; the surface is prepared again
         path.unlink(missing_ok=True)
         return None
 
 
 def write(key: str, arrays: Mapping[str, np.ndarray]) -> None:
-    """Store arrays under a key; a cache that cannot be written is no reason to stop the work."""
+    """Store arrays under a key. If the cache cannot be written, nothing is stored."""
     folder = cache_folder() / "surfaces"
     temporary: str | None = None
     try:

@@ -1,4 +1,4 @@
-"""Meshes known by name: fetched from public addresses, shipped in packages, or computed."""
+"""Meshes with a name: downloaded, part of an installed package, or computed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.surfaces import bundled, shapes
 from nsm.surfaces.cache import cache_folder
-from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.loading import error_in, load_mesh
 
 TIMEOUT_SECONDS = 30
+_INSTEAD = "use surface=terrain or surface.path=FILE, or set NSM_MESH_URL to a mirror"
 _CLASSIC = "https://raw.githubusercontent.com/alecjacobson/common-3d-test-models/master/data"
 _ANIMALS = (
     "https://raw.githubusercontent.com/patr-schm/surface-maps-via-adaptive-triangulations/"
@@ -25,7 +26,7 @@ _ANIMALS = (
 
 @dataclass(frozen=True)
 class _Remote:
-    """A file at a public address; file is its name in the cache and on a mirror."""
+    """A file at a public address; ``file`` is its name in the cache and on a mirror."""
 
     file: str
     url: str
@@ -105,18 +106,21 @@ _LOCAL: dict[str, tuple[Callable[[], shapes.Mesh], str]] = {
 
 
 def catalogue_names() -> dict[str, str]:
-    """Every name with a line on what the mesh is, in alphabetical order."""
+    """All names, in alphabetical order, with a one-line description of each mesh."""
     lines = {name: remote.description for name, remote in _REMOTE.items()}
     lines.update({name: description for name, (_, description) in _LOCAL.items()})
     return dict(sorted(lines.items()))
 
 
 def catalogue_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V,3) float64 and triangles (F,3) int64 of a mesh of the catalogue, unrepaired.
+    """Vertices (V, 3) float64 and triangles (F, 3) int64 of a mesh of the catalogue, unrepaired.
 
-    A fetched mesh is kept in the cache folder and checked against its sha256; the environment
-    variable NSM_MESH_URL names a mirror, a folder that holds the files under their own names.
-    NsmError for an unknown name, a missing optional package, or a failed or wrong download.
+    A downloaded mesh is checked against its sha256 and kept in the cache folder. The environment
+    variable NSM_MESH_URL may name a mirror: a folder that has the files under the same names.
+
+    Raises:
+        NsmError: ``unknown_surface``, ``missing_package``, ``cache_not_writable``,
+            ``download_failed`` or ``wrong_checksum``. The key is the name of the mesh or package.
     """
     if name in _LOCAL:
         return _LOCAL[name][0]()
@@ -125,7 +129,9 @@ def catalogue_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
     near = difflib.get_close_matches(name, catalogue_names(), n=1, cutoff=0.0)
     raise NsmError(
         f"'{name}' is not in the catalogue; did you mean '{near[0]}'? "
-        "For a mesh of your own use surface.path=FILE"
+        "For your own mesh use surface.path=FILE",
+        kind="unknown_surface",
+        key=name,
     )
 
 
@@ -143,20 +149,17 @@ def _fetch(name: str, remote: _Remote) -> tuple[np.ndarray, np.ndarray]:
             downloader=pooch.HTTPDownloader(timeout=TIMEOUT_SECONDS),
         )
     except PermissionError as error:
-        raise NsmError(
-            f"{name}: cannot write to {error.filename or cache_folder()}; set NSM_CACHE to a "
-            "folder that can be written"
-        ) from error
+        reason = f"cannot write to {error.filename or cache_folder()}"
+        raise error_in(name, "cache_not_writable", f"{reason}; set NSM_CACHE") from error
     except OSError as error:  # requests' errors are OSErrors: no network, no such file, timeout
-        raise NsmError(
-            f"{name}: cannot fetch {url} ({type(error).__name__}); without a network use "
-            "surface=terrain or surface.path=FILE, or set NSM_MESH_URL to a mirror"
-        ) from error
-    except ValueError as error:  # pooch's word for another checksum, and for an unusable address
-        reason = "its checksum is wrong" if "hash" in str(error) else "not a usable address"
-        raise NsmError(
-            f"{name}: {url} is not the expected file ({reason}); check NSM_MESH_URL, or use "
-            "surface=terrain or surface.path=FILE"
-        ) from error
+        reason = f"cannot download {url} ({type(error).__name__}); {_INSTEAD}"
+        raise error_in(name, "download_failed", reason) from error
+    except ValueError as error:  # pooch raises it for a wrong checksum and for an unusable address
+        kind, reason = (
+            ("wrong_checksum", "has the wrong checksum")
+            if "hash" in str(error)
+            else ("download_failed", "is not a usable address")
+        )
+        raise error_in(name, kind, f"{url} {reason}; {_INSTEAD}") from error
     vertices, faces, _ = load_mesh(file)
     return vertices, faces

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-_DIRECTIONS = 200  # that ambient occlusion looks in
+_DIRECTIONS = 200  # of rays for ambient occlusion
 
 
 def subdivide(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split each triangle in four at its edges' middles: points (V, d), faces (F, 3) of the new."""
+    """Points (V, d) and faces (F, 3) of the mesh with each triangle split in four at midpoints."""
     import igl
 
     fine, fine_faces = igl.upsample(np.ascontiguousarray(points), faces, 1)
@@ -18,11 +18,11 @@ def subdivide(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 def decimate(
     vertices: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Collapse the shortest edges of a mesh (V, 3), (F, 3) until about ``count`` faces are left.
+    """Collapse the shortest edges of a mesh (V, 3), (F, 3) until about ``count`` faces remain.
 
     Returns:
-        the old index (W,) of each vertex, which stays in its place; the new faces (G, 3), and of
-        each the old face (G,) that it came from.
+        The old index (W,) of each vertex, none of which moves; the new faces (G, 3); and the old
+        face (G,) of each.
     """
     import igl
 
@@ -33,21 +33,21 @@ def decimate(
 
 
 def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The share (V,) of a mesh's own half space that each vertex does not see for the mesh.
+    """The share (V,) of the outer half space that the mesh hides from each vertex.
 
-    Directions are evenly spread: libigl's own function draws them anew at each call, and a seam
-    that is led by what is hidden would not come again.
+    The rays have fixed directions, evenly spread. libigl's function draws them at random, so a
+    seam that depends on it could not be reproduced.
     """
     import igl
 
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    unit = (vertices - low) / np.linalg.norm(high - low)  # libigl's tolerances are lengths
+    unit = (vertices - low) / np.linalg.norm(high - low)  # libigl's tolerances are absolute
     normals = igl.per_vertex_normals(unit, faces)
     tree = igl.AABB()
     tree.init(unit, faces)
     number = np.arange(_DIRECTIONS) + 0.5
     height, angle = 1 - 2 * number / _DIRECTIONS, np.pi * (1 + 5**0.5) * number
-    radius = np.sqrt(1 - height**2)  # Fibonacci's spiral
+    radius = np.sqrt(1 - height**2)  # a Fibonacci spiral
     hits = np.zeros(len(vertices))
     for direction in np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1):
         outward = np.where(normals @ direction < 0, -1.0, 1.0)[:, None] * direction
@@ -58,7 +58,7 @@ def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def point_mesh_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Distances (N,) from points (N, 3) to a mesh; infinite where either is not finite."""
+    """Distances (N,) from points (N, 3) to a mesh; infinite if any coordinate is not finite."""
     import igl
 
     if not (np.isfinite(points).all() and np.isfinite(vertices).all()):
@@ -72,10 +72,10 @@ def point_mesh_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndar
 def triangle_distortion(
     points: np.ndarray, image: np.ndarray, faces: np.ndarray, eps: float = 0.01
 ) -> np.ndarray:
-    """Symmetric Dirichlet (F,) of each triangle's affine map from points (V, 3) to image (V, 3).
+    """Symmetric Dirichlet energy (F,) of each triangle's affine map from points to image (V, 3).
 
-    tr(M) + tr((M + eps I)⁻¹), METHOD Eq. 2, by the trace and determinant of A⁻¹B, which are M's;
-    infinite where a triangle of points has no area.
+    METHOD Eq. 2, tr(M) + tr((M + eps I)⁻¹), from the trace and determinant of M = A⁻¹B; infinite
+    for degenerate triangles of points.
     """
 
     def forms(p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
-"""What a glTF file asks for, looked at before it is given: files beside it, and memory.
+"""Checks of glTF files from untrusted sources, before they are read.
 
-A glTF file names further files, says how many numbers it holds, and how often a part is repeated.
-From a stranger, each may be a lie.
+A glTF file names further files, the sizes of its arrays and the number of instances of a mesh.
+All of them may be wrong, or an attack.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from urllib.parse import unquote
 from trimesh.resolvers import Resolver
 
 _LARGEST_JSON = 100 * 2**20  # bytes
-_MOST_INSTANCES = 10_000  # of meshes in a scene
-_DEEPEST = 100  # nodes within nodes
+_MOST_NODES = 10_000  # of a scene, with repetitions
+_DEEPEST = 100  # nested nodes
 _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
-class Beside(Resolver):
-    """Files that a mesh file names, from its own folder and the folders in it alone.
+class FolderResolver(Resolver):
+    """Reads the files that a mesh file names, but only from its folder and the folders below.
 
     Args:
-        folder: of the mesh file.
+        folder: the folder of the mesh file.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -35,34 +35,34 @@ class Beside(Resolver):
         """The contents of a file.
 
         Raises:
-            ValueError: it lies elsewhere, or is no regular file.
+            ValueError: the file is outside the folder, or not a regular file.
         """
         file = (self.folder / unquote(str(key))).resolve()
         if not file.is_relative_to(self.folder):
-            raise ValueError(f"it names {key!r}, which is outside of its folder")
+            raise ValueError(f"it refers to {key!r}, outside its folder")
         if not file.is_file():
-            raise ValueError(f"it names {key!r}, and there is no such file")
+            raise ValueError(f"it refers to the missing file {key!r}")
         return file.read_bytes()
 
     def write(self, name: str, data: bytes) -> None:
-        """Nothing is written."""
+        """Refuse to write."""
         raise ValueError("reading a mesh writes nothing")
 
-    def namespaced(self, namespace: str) -> Beside:
-        """The same for a folder in this one."""
-        return Beside(self.folder / namespace)
+    def namespaced(self, namespace: str) -> FolderResolver:
+        """The resolver of a folder below."""
+        return FolderResolver(self.folder / namespace)
 
     def keys(self) -> list[str]:
-        """No list is given."""
+        """Nothing: the files are not listed."""
         return []
 
 
 def check_gltf(file: Path) -> None:
-    """Look at what a GLTF or GLB file announces.
+    """Check the sizes and the node tree of a glTF or GLB file.
 
     Raises:
-        ValueError: arrays that are not stored, whose size is made up, parts within themselves, or
-            too many copies of them.
+        ValueError: arrays without data or larger than their data, cycles of nodes, or too many
+            nodes.
     """
     tree = _tree(file)
     views = _listed(tree, "bufferViews")
@@ -71,21 +71,21 @@ def check_gltf(file: Path) -> None:
         width = _BYTES.get(accessor.get("componentType", 0), 1)
         size = count * width * _COMPONENTS.get(str(accessor.get("type")), 1)
         if "bufferView" not in accessor:
-            raise ValueError("an array of it is not stored")
+            raise ValueError("an accessor has no bufferView")
         k = _number(accessor, "bufferView")
         if k >= len(views) or size > _number(views[k], "byteLength"):
-            raise ValueError(f"an array of {size} bytes is announced, and not there")
+            raise ValueError(f"an accessor of {size} bytes exceeds its bufferView")
     nodes = _listed(tree, "nodes")
     for scene in _listed(tree, "scenes"):
-        left = _MOST_INSTANCES
+        left = _MOST_NODES
         stack = [(child, 0) for child in scene.get("nodes", [])]
         while stack:
             k, depth = stack.pop()
             left -= 1
             if left < 0 or depth > _DEEPEST:
-                raise ValueError(f"more than {_MOST_INSTANCES} parts, or parts within themselves")
+                raise ValueError(f"more than {_MOST_NODES} nodes, or a cycle of nodes")
             if not isinstance(k, int) or not 0 <= k < len(nodes):
-                raise ValueError("a part of it is not there")
+                raise ValueError("a node is missing")
             stack += [(child, depth + 1) for child in nodes[k].get("children", [])]
 
 
@@ -97,7 +97,7 @@ def _tree(file: Path) -> dict[str, Any]:
                 raise ValueError("no GLB header")
             length = struct.unpack("<I", data[12:16])[0]
             if not 0 < length <= min(_LARGEST_JSON, file.stat().st_size):
-                raise ValueError(f"{length} bytes of JSON announced, and not there")
+                raise ValueError(f"the JSON chunk of {length} bytes is truncated or too large")
             text = stream.read(length)
         else:
             if file.stat().st_size > 2 * _LARGEST_JSON:
@@ -105,14 +105,14 @@ def _tree(file: Path) -> dict[str, Any]:
             text = data + stream.read()
     tree = json.loads(text)
     if not isinstance(tree, dict):
-        raise ValueError("no glTF")
+        raise ValueError("not glTF")
     return tree
 
 
 def _listed(tree: dict[str, Any], key: str) -> list[dict[str, Any]]:
     items = tree.get(key, [])
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise ValueError(f"{key} is no list of objects")
+        raise ValueError(f"{key} is not a list of objects")
     return items
 
 

@@ -1,15 +1,16 @@
 """Read a mesh file into vertices and triangles, in the file's own vertex order.
 
-OBJ and OFF are read here, line by line, because general loaders split or reorder vertices
-at texture seams, and users name landmarks by the vertex numbers of their file. PLY goes through
-plyfile (ascii, binary, triangle strips); STL and glTF through trimesh.
+The readers of OBJ and OFF are ours: general loaders split or reorder vertices at texture seams,
+and users name landmarks by the vertex numbers of their file. PLY goes through plyfile (ascii,
+binary, triangle strips); STL and glTF through trimesh.
 """
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -21,50 +22,78 @@ LARGEST_FILE = 4 * 2**30  # bytes
 EXTENSIONS = (".obj", ".ply", ".off", ".stl", ".gltf", ".glb")
 
 
-def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Vertices (V,3) float64, triangles (F,3) int64 and a log of what was converted.
+def error_in(what: object, kind: str, reason: str) -> NsmError:
+    """An error about a file or surface: its key, with which the message starts."""
+    return NsmError(f"{what}: {reason}", kind=kind, key=str(what))
 
-    Vertices are in the order of the file, in the file's units. NsmError if the file is missing,
-    of an unknown kind, unreadable, without faces, or holds NaN, infinities or bad indices.
+
+def is_mesh_path(text: str) -> bool:
+    """Whether a word of the command line names a mesh file, rather than a catalogue entry.
+
+    It does if such a file exists, or if it ends in one of EXTENSIONS. An existing file may contain
+    ``=`` in its name; any other word with ``=`` is a setting.
     """
-    file = Path(path)
-    suffix = file.suffix.lower()
+    if os.path.isfile(text):
+        return True
+    return "=" not in text and PurePath(text).suffix.lower() in EXTENSIONS
+
+
+def check_file(file: Path, largest: int, endings: Sequence[str] = ()) -> None:
+    """Check that a file is regular, has at most ``largest`` bytes and, if given, a known ending.
+
+    Raises:
+        NsmError: ``missing_file``, ``unreadable_file``, ``not_a_file``, ``unknown_format`` or
+            ``file_too_large``. The key is the path.
+    """
     try:
         status = file.stat()
     except FileNotFoundError:
-        raise NsmError(f"{file}: no such file; check the path") from None
+        raise error_in(file, "missing_file", "no such file; check the path") from None
     except (OSError, ValueError) as error:  # too long, a loop of links, not allowed, a NUL in it
         reason = getattr(error, "strerror", None) or "not a path"
-        raise NsmError(f"{file}: {reason}; check the path") from error
-    if stat.S_ISDIR(status.st_mode):
-        raise NsmError(f"{file}: is a folder; give a mesh file")
-    if suffix not in EXTENSIONS:
-        raise NsmError(
-            f"{file}: unknown mesh format '{suffix}'; use one of {', '.join(EXTENSIONS)}"
-        )
-    if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for, a device read for ever
-        raise NsmError(f"{file}: not a regular file; give a mesh file")
-    if status.st_size > LARGEST_FILE:
-        raise NsmError(
-            f"{file}: larger than {LARGEST_FILE / 2**30:.0f} GB; simplify the mesh before"
-        )
+        raise error_in(file, "unreadable_file", f"{reason}; check the path") from error
+    if not stat.S_ISREG(status.st_mode):  # reading a pipe blocks, reading a device never ends
+        raise error_in(file, "not_a_file", "not a regular file; give a file")
+    if endings and file.suffix.lower() not in endings:
+        reason = f"unknown format '{file.suffix}'; use one of {', '.join(endings)}"
+        raise error_in(file, "unknown_format", reason)
+    if status.st_size > largest:
+        raise error_in(file, "file_too_large", f"larger than {largest / 2**20:.0f} MB")
+
+
+def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Read a mesh file.
+
+    Returns:
+        Vertices (V, 3) float64 in the order and units of the file, triangles (F, 3) int64, and one
+        log line per conversion.
+
+    Raises:
+        NsmError: ``unreadable_file``, or as :func:`check_file` and :func:`check_arrays`. The key
+            is the path.
+    """
+    file = Path(path)
+    suffix = file.suffix.lower()
+    check_file(file, LARGEST_FILE, EXTENSIONS)
     reader = {".obj": _read_obj, ".off": _read_off, ".ply": _read_ply}.get(suffix, _read_trimesh)
     try:
         vertices, faces, log = reader(file)
     except NsmError:
         raise
-    except Exception as error:  # parsers raise anything at all on broken files
-        reason = " ".join(str(error).split())[:150] or type(error).__name__
-        raise NsmError(
-            f"{file}: not a readable {suffix[1:].upper()} mesh ({reason}); "
-            "it may be truncated or of another format: export it again"
-        ) from error
+    except Exception as error:  # parsers raise any exception on damaged files
+        cause = " ".join(str(error).split())[:150] or type(error).__name__
+        reason = f"not a readable {suffix[1:].upper()} mesh ({cause}); export it again"
+        raise error_in(file, "unreadable_file", reason) from error
     check_arrays(vertices, faces, str(file))
     return vertices, faces, tuple(log)
 
 
 def as_arrays(vertices: Any, faces: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices as float64 and faces as int64; NsmError for what is no real, or no whole, number."""
+    """Convert vertices to float64 and faces to int64.
+
+    Raises:
+        NsmError: ``wrong_type``, vertices that are not real numbers or faces that are not integers.
+    """
     try:
         vertices, given = np.asarray(vertices), np.asarray(faces)
         if vertices.dtype.kind not in "fiub" or given.dtype.kind not in "fiub":
@@ -74,78 +103,77 @@ def as_arrays(vertices: Any, faces: Any, name: str) -> tuple[np.ndarray, np.ndar
         if not np.array_equal(faces, given):
             raise ValueError
     except (TypeError, ValueError) as error:
-        raise NsmError(
-            f"{name}: vertices must be real numbers (V, 3), and faces whole ones (F, 3)"
-        ) from error
+        reason = "give vertices as real numbers (V, 3) and faces as integers (F, 3)"
+        raise error_in(name, "wrong_type", reason) from error
     return vertices.astype(np.float64), faces
 
 
 def check_arrays(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
-    """NsmError unless vertices are (V,3) finite and faces (F,3) valid indices, F > 0."""
+    """Check that vertices are (V, 3) and finite and that faces are (F, 3) valid indices, F > 0.
+
+    Raises:
+        NsmError: ``wrong_shape``, ``not_a_mesh`` (no vertices or no faces), ``not_finite`` or
+            ``out_of_range`` (a face with an unknown vertex). The key is the name.
+    """
     for what, array in (("vertices", vertices), ("faces", faces)):
         if array.size and (array.ndim != 2 or array.shape[1] != 3):
-            raise NsmError(
-                f"{name}: {what} of shape {array.shape}; give points in space (V, 3) and triangles "
-                "(F, 3)"
-            )
-    if vertices.size == 0:
-        raise NsmError(f"{name}: holds no 3D vertices; export it again as a triangle mesh")
-    if faces.size == 0:
-        raise NsmError(f"{name}: holds no faces (a point cloud or text?); give a triangle mesh")
-    if not np.isfinite(vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise NsmError(f"{name}: vertex {bad} is NaN or infinite; repair it in a mesh editor")
+            reason = f"{what} have the shape {array.shape}; give vertices and triangles (N, 3)"
+            raise error_in(name, "wrong_shape", reason)
+        if array.size == 0:
+            raise error_in(name, "not_a_mesh", f"no {what}; give a triangle mesh")
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        reason = f"vertex {int(finite.argmin())} is NaN or infinite; repair it in a mesh editor"
+        raise error_in(name, "not_finite", reason)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise NsmError(
-            f"{name}: a face names vertex {int(faces.max() if faces.min() >= 0 else faces.min())}"
-            f" but there are {len(vertices)}; the file is truncated or damaged: export it again"
-        )
+        wrong = int(faces.max() if faces.min() >= 0 else faces.min())
+        reason = f"a face uses vertex {wrong}, but there are {len(vertices)}; export it again"
+        raise error_in(name, "out_of_range", reason)
 
 
 _Read = tuple[np.ndarray, np.ndarray, list[str]]
 
 
-def _fan(polygons: Iterable[Sequence[int]]) -> tuple[np.ndarray, int]:
-    """Triangles of polygons by fans, and how many polygons had more than three corners."""
+def _triangulated(vertices: Any, polygons: Iterable[Sequence[int]]) -> _Read:
+    """Vertices (V, 3), and polygons split into triangle fans."""
     rings = [list(polygon) for polygon in polygons]
     if any(len(ring) < 3 for ring in rings):
         raise ValueError("a face has fewer than three corners")
     larger = [ring for ring in rings if len(ring) > 3]
     if larger:
-        # Two quads may share two sides; the same diagonal in both would be an edge of four
-        # triangles, so a quad whose diagonal is taken is split along its other one.
+        # Two quads may share two sides; the same diagonal in both would be a non-manifold edge, so
+        # a quad whose diagonal exists is split along its other one.
         taken = {frozenset(side) for r in rings for side in zip(r, r[1:] + r[:1], strict=True)}
         for ring in larger:
             if frozenset((ring[0], ring[2])) in taken:
                 ring.append(ring.pop(0))
             taken.update(frozenset((ring[0], corner)) for corner in ring[2:-1])
     triangles = [(ring[0], ring[i], ring[i + 1]) for ring in rings for i in range(1, len(ring) - 1)]
-    return np.array(triangles, dtype=np.int64).reshape(-1, 3), len(larger)
-
-
-def _fan_log(larger: int) -> list[str]:
-    return [f"{larger} faces with more than three corners were triangulated"] if larger else []
+    return (
+        np.array(vertices, dtype=np.float64).reshape(-1, 3),
+        np.array(triangles, dtype=np.int64).reshape(-1, 3),
+        [f"{len(larger)} polygons triangulated"] if larger else [],
+    )
 
 
 def _read_obj(file: Path) -> _Read:
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    text = _text(file).replace("\\\r\n", " ").replace("\\\n", " ")  # lines that are continued
+    text = _text(file).replace("\\\r\n", " ").replace("\\\n", " ")  # continued lines
     for line in text.splitlines():
-        words = line.split("#")[0].split()
-        if words[:1] == ["v"]:
-            vertices.append([float(word) for word in words[1:4]])
-        elif words[:1] == ["f"]:
+        fields = line.split("#")[0].split()
+        if fields[:1] == ["v"]:
+            vertices.append([float(field) for field in fields[1:4]])
+        elif fields[:1] == ["f"]:
             corners = []
-            for word in words[1:]:
-                index = int(word.split("/")[0])
+            for field in fields[1:]:
+                index = int(field.split("/")[0])
                 if index == 0:
-                    raise ValueError("a face names vertex 0, but OBJ counts from 1")
-                # negative numbers count back from the vertices read so far
+                    raise ValueError("a face uses vertex 0, but OBJ counts from 1")
+                # negative indices count back from the last vertex read
                 corners.append(index - 1 if index > 0 else len(vertices) + index)
             polygons.append(corners)
-    faces, larger = _fan(polygons)
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), faces, _fan_log(larger)
+    return _triangulated(vertices, polygons)
 
 
 def _read_off(file: Path) -> _Read:
@@ -156,20 +184,20 @@ def _read_off(file: Path) -> _Read:
     rows = ([rows[0][1:]] if len(rows[0]) > 1 else []) + rows[1:]
     n_vertices, n_faces = int(rows[0][0]), int(rows[0][1])
     if min(n_vertices, n_faces) < 0:
-        raise ValueError(f"{min(n_vertices, n_faces)} announced of what is counted")
+        raise ValueError("the header has a negative count")
     if len(rows) < 1 + n_vertices + n_faces:
         raise ValueError(
-            f"{n_vertices} vertices and {n_faces} faces announced, {len(rows) - 1} lines found"
+            f"the header announces {n_vertices} vertices and {n_faces} faces, "
+            f"but {len(rows) - 1} lines follow"
         )
-    vertices = np.array([row[:3] for row in rows[1 : 1 + n_vertices]], dtype=np.float64)
+    vertices = [[float(x) for x in row[:3]] for row in rows[1 : 1 + n_vertices]]
     polygons = []
     for row in rows[1 + n_vertices : 1 + n_vertices + n_faces]:
         count = int(row[0])
         if len(row) < 1 + count:
-            raise ValueError("a face line is cut short")
-        polygons.append([int(word) for word in row[1 : 1 + count]])
-    faces, larger = _fan(polygons)
-    return vertices.reshape(-1, 3), faces, _fan_log(larger)
+            raise ValueError("a face line is too short")
+        polygons.append([int(index) for index in row[1 : 1 + count]])
+    return _triangulated(vertices, polygons)
 
 
 def _read_ply(file: Path) -> _Read:
@@ -178,48 +206,50 @@ def _read_ply(file: Path) -> _Read:
     _check_ply_header(file)
     with file.open("rb") as stream:
         ply = PlyData.read(stream)
-    elements = {element.name: element for element in ply.elements}
+    elements = {element.name: element.data for element in ply.elements}
     if "vertex" not in elements:
         raise ValueError("no vertex element")
-    data = elements["vertex"].data
+    data = elements["vertex"]
     vertices = np.stack([np.asarray(data[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    if "face" in elements and len(elements["face"].data):
-        face = elements["face"].data
+    if len(elements.get("face", ())):
+        face = elements["face"]
         names = face.dtype.names or ()
         key = next((n for n in ("vertex_indices", "vertex_index") if n in names), None)
         if key is None:
             raise ValueError("the face element has no vertex_indices")
-        faces, larger = _fan([list(map(int, row)) for row in face[key]])
-        return vertices, faces, _fan_log(larger)
-    if "tristrips" in elements and len(elements["tristrips"].data):
-        strips = elements["tristrips"].data
+        return _triangulated(vertices, [list(map(int, row)) for row in face[key]])
+    if len(elements.get("tristrips", ())):
+        strips = elements["tristrips"]
         key = (strips.dtype.names or ("vertex_indices",))[0]
-        faces = np.concatenate([strips_to_triangles(np.asarray(row)) for row in strips[key]])
-        return vertices, faces, [f"{len(faces)} triangles were unrolled from triangle strips"]
+        faces = np.concatenate([_strip_triangles(np.asarray(row)) for row in strips[key]])
+        return vertices, faces, [f"triangle strips converted to {len(faces)} triangles"]
     return vertices, np.zeros((0, 3), dtype=np.int64), []
 
 
 def _check_ply_header(file: Path) -> None:
-    """ValueError if the header announces more than the file can hold: room is made for it."""
+    """ValueError if the header announces more than the file can hold: plyfile allocates it."""
     with file.open("rb") as stream:
         head = stream.read(_LONGEST_HEADER).partition(b"end_header")[0]
     size = file.stat().st_size
     for line in head.splitlines():
-        words = line.split()
-        if words[:1] == [b"element"] and len(words) == 3:
-            if not 0 <= int(words[2]) <= size:
-                raise ValueError(f"{int(words[2])} of an element in {size} bytes")
+        fields = line.split()
+        if fields[:1] == [b"element"] and len(fields) == 3:
+            if not 0 <= int(fields[2]) <= size:
+                raise ValueError(
+                    f"the header announces {int(fields[2])} elements in a file of {size} bytes"
+                )
 
 
-def strips_to_triangles(strip: np.ndarray) -> np.ndarray:
-    """Triangles (F,3) of -1-separated strips (N,): every second triangle is turned round.
+def _strip_triangles(strip: np.ndarray) -> np.ndarray:
+    """Triangles (F, 3) of strips (N,) separated by -1; every second one is reversed.
 
-    Strips repeat vertices to restart without a separator; those empty triangles are left out.
+    Strips repeat vertices to restart without a separator; the degenerate triangles of a restart
+    are left out.
     """
     strip = np.asarray(strip, dtype=np.int64)
     triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
     start = np.where(strip == -1, np.arange(len(strip)) + 1, 0)
-    position = np.arange(len(strip)) - np.maximum.accumulate(start)  # place within its strip
+    position = np.arange(len(strip)) - np.maximum.accumulate(start)  # within its strip
     odd = position[: len(triangles)] % 2 == 1
     triangles[odd] = triangles[odd][:, [1, 0, 2]]
     a, b, c = triangles.T
@@ -229,35 +259,30 @@ def strips_to_triangles(strip: np.ndarray) -> np.ndarray:
 def _read_trimesh(file: Path) -> _Read:
     import trimesh
 
-    from nsm.surfaces.gltf import Beside, check_gltf
+    from nsm.surfaces.gltf import FolderResolver, check_gltf
 
     kind = file.suffix.lower()[1:]
     if kind in ("gltf", "glb"):
         check_gltf(file)
     with file.open("rb") as stream:
         loaded = trimesh.load(
-            stream, file_type=kind, process=False, resolver=Beside(file.parent), allow_remote=False
+            stream,
+            file_type=kind,
+            process=False,
+            resolver=FolderResolver(file.parent),
+            allow_remote=False,
         )
-    log: list[str] = []
-    if isinstance(loaded, trimesh.Scene):
-        meshes = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
-        if not meshes:
-            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), log
-        if len(meshes) > 1:
-            log.append(f"{len(meshes)} parts of the scene were put together")
-        offsets = np.cumsum([0] + [len(m.vertices) for m in meshes])
-        vertices = np.concatenate([np.asarray(m.vertices, dtype=np.float64) for m in meshes])
-        faces = np.concatenate(
-            [np.asarray(m.faces, dtype=np.int64) + o for m, o in zip(meshes, offsets, strict=False)]
-        )
-        return vertices, faces, log
-    if not isinstance(loaded, trimesh.Trimesh):
-        return np.zeros((1, 3)), np.zeros((0, 3), dtype=np.int64), log
-    return (
-        np.array(loaded.vertices, dtype=np.float64),
-        np.array(loaded.faces, dtype=np.int64),
-        log,
+    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
+    if not meshes:
+        raise ValueError("no triangles")
+    log = [f"{len(meshes)} meshes of the scene combined"] if len(meshes) > 1 else []
+    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    vertices = np.concatenate([np.asarray(m.vertices, dtype=np.float64) for m in meshes])
+    faces = np.concatenate(
+        [np.asarray(m.faces, dtype=np.int64) + o for m, o in zip(meshes, offsets, strict=True)]
     )
+    return vertices, faces, log
 
 
 def _text(file: Path) -> str:

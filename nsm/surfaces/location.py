@@ -1,4 +1,4 @@
-"""From points to places on a triangulated surface, and back."""
+"""Points on a triangle mesh: the nearest ones to given points, and values interpolated there."""
 
 from __future__ import annotations
 
@@ -6,26 +6,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-_FAR = 1e6  # times the size of a mesh
+_FAR = 1e6  # in sizes of the mesh
 _LARGEST = 1e300
 
 
 class Places(NamedTuple):
-    """Places on a mesh: the face (N,) and barycentric weights (N, 3) of its corners."""
+    """Points on a mesh.
+
+    Attributes:
+        face: (N,) the face of each point.
+        weights: (N, 3) its barycentric coordinates in that face.
+    """
 
     face: np.ndarray
     weights: np.ndarray
 
     def take(self, values: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Values (V, ...) at vertices, interpolated at the places: (N, ...)."""
+        """Values (V, ...) at the vertices, interpolated at the points: (N, ...)."""
         corners = values[faces[self.face]]
         return np.einsum("nk,nk...->n...", self.weights, corners)
 
 
 def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Places:
-    """The nearest place on a mesh (V, d), (F, 3) for each point (N, d), in the plane or space.
+    """The nearest point on a mesh to each given point, in the plane or in space.
 
-    Points off the mesh go to the nearest place on it.
+    Args:
+        points: (N, d), d = 2 or 3.
+        vertices: (V, d).
+        faces: (F, 3).
     """
     import igl
 
@@ -34,18 +42,18 @@ def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Place
         return np.ascontiguousarray(np.pad(p, ((0, 0), (0, 3 - p.shape[1]))))
 
     mesh = spatial(vertices)
-    near = _near(spatial(points), mesh)
+    near = _pulled_near(spatial(points), mesh)
     _, face, nearest = igl.point_mesh_squared_distance(near, mesh, faces)
     face = np.asarray(face, dtype=np.int64).reshape(-1)
     corners = mesh[faces[face]]
     return Places(face, _barycentric(np.asarray(nearest), corners))
 
 
-def _near(points: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-    """Points (N, 3), those very far from a mesh (V, 3) drawn straight towards its middle.
+def _pulled_near(points: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Points (N, 3), with those very far from a mesh (V, 3) moved straight towards its centre.
 
-    What is nearest stays so; the squares of their distances could not be told apart, or be
-    infinite, and libigl would then name a face that is not there.
+    Their nearest points do not change. Without it, squared distances would be equal or infinite
+    after rounding, and libigl would return a face that does not exist.
     """
     low, high = mesh.min(axis=0), mesh.max(axis=0)
     offset = points.clip(-_LARGEST, _LARGEST) - 0.5 * (low + high)
@@ -58,7 +66,7 @@ def _near(points: np.ndarray, mesh: np.ndarray) -> np.ndarray:
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Weights (N, 3) of points (N, 3) in the planes of triangles (N, 3, 3), clipped to them."""
+    """Barycentric coordinates (N, 3) of points (N, 3) in triangles (N, 3, 3), clipped to them."""
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = points - corners[:, 0]
     d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)

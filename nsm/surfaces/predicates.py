@@ -1,4 +1,4 @@
-"""Orientation in the plane, decided without rounding error."""
+"""Exact orientation of planar triangles."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from fractions import Fraction
 
 import numpy as np
 
-# Shewchuk 1997, "Adaptive precision floating-point arithmetic": past (3 + 16ε)ε of the sum of the
-# two products, ε = 2⁻⁵³, the rounded determinant has the right sign
+# Shewchuk 1997, "Adaptive precision floating-point arithmetic": the rounded determinant has the
+# right sign if it exceeds (3 + 16ε)ε times the sum of the two products, ε = 2⁻⁵³
 _BOUND = (3 + 16 * 2.0**-53) * 2.0**-53
 _UNDERFLOW = 1e-300
 
 
 def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Exact signs of the areas of triangles abc: 1 counter-clockwise, -1 clockwise, 0 neither.
+    """Exact signs of the areas of triangles abc: 1 counter-clockwise, -1 clockwise, else 0.
 
-    The few that floating point cannot tell are computed in rational numbers.
+    Where floating point does not decide, rational numbers do.
 
     Args:
-        a, b, c: points (N, 2); or (2,), which stand for N times themselves.
+        a, b, c: points (N, 2), or one point (2,) for all triangles.
 
     Returns:
-        (N,) int; 0 also where a coordinate is not finite.
+        (N,) int; 0 also if a coordinate is not finite.
     """
     a, b, c = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (a, b, c)))
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):

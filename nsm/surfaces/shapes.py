@@ -1,7 +1,7 @@
-"""Meshes of plain shapes, computed: planes, spheres, tori and the like.
+"""Meshes of simple shapes: planes, spheres, tori and others.
 
-Every function returns vertices (V,3) float64 and triangles (F,3) int64, counter-clockwise seen
-from outside, or from above (+z) for open height fields. Lengths are in the shape's own unit.
+Every function returns vertices (V, 3) float64 and triangles (F, 3) int64, counter-clockwise seen
+from outside, or from above (+z) for open height fields.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Mesh = tuple[np.ndarray, np.ndarray]
 def grid_faces(
     rows: int, columns: int, *, wrap_rows: bool = False, wrap_columns: bool = False
 ) -> np.ndarray:
-    """Triangles (F,3) of a grid of rows x columns vertices, numbered row by row.
+    """Triangles (F, 3) of a grid of rows x columns vertices, numbered row by row.
 
-    Counter-clockwise where columns run along x and rows along y. A wrapped direction joins its
-    last vertices to its first. Diagonals alternate, so that no direction is preferred and, with
-    odd vertex counts, no triangle of a corner has two sides on the boundary.
+    They are counter-clockwise if columns run along x and rows along y. A wrapped direction connects
+    its last vertices to its first. Diagonals alternate: no direction is preferred and, with odd
+    vertex counts, no triangle at a corner has two boundary edges.
     """
     cells = np.meshgrid(
         np.arange(rows if wrap_rows else rows - 1),
@@ -73,13 +73,13 @@ def cone(rings: int = 24, height: float = 1.5) -> Mesh:
 
 
 def ring_mesh(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """A triangulated unit disc of rings: points (V, 2), faces (F, 3)."""
+    """A mesh of the unit disc in concentric rings: points (V, 2), faces (F, 3)."""
     radius, angle, faces = _rings(rings)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1), faces
 
 
 def grid_mesh(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """A triangulated square [-1, 1]² of side × side points: points (V, 2), faces (F, 3)."""
+    """A mesh of the square [-1, 1]² with side × side points: points (V, 2), faces (F, 3)."""
     x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
     return np.stack([x.ravel(), y.ravel()], axis=1), grid_faces(side, side)
 
@@ -113,7 +113,7 @@ def cylinder(around: int = 64, along: int = 31) -> Mesh:
 
 
 def torus(around: int = 64, across: int = 32, tube: float = 0.4) -> Mesh:
-    """A torus about the z axis: the tube of the given radius runs along the unit circle."""
+    """A torus about the z axis: a tube of the given radius around the unit circle."""
     small, large = np.meshgrid(
         2 * np.pi * np.arange(across) / across,
         2 * np.pi * np.arange(around) / around,
@@ -128,21 +128,12 @@ def torus(around: int = 64, across: int = 32, tube: float = 0.4) -> Mesh:
 
 def sphere(subdivisions: int = 4) -> Mesh:
     """The unit sphere as a subdivided icosahedron; 10 * 4^subdivisions + 2 vertices."""
-    g = (1 + 5**0.5) / 2
-    vertices = np.array(
-        [
-            (-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g),
-            (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1),
-        ]
-    )  # fmt: skip
-    faces = np.array(
-        [
-            (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
-            (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
-            (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1),
-        ],
-        dtype=np.int64,
-    )  # fmt: skip
+    from trimesh.creation import icosahedron
+
+    base = icosahedron()
+    # with the vertices (±1, ±g, 0) and so on, where g is the golden ratio
+    vertices = np.array(base.vertices / base.vertices[1, 0])
+    faces = np.array(base.faces, dtype=np.int64)
     for _ in range(subdivisions):
         edges = topology.edges_of(faces)
         ab, bc, ca = (len(vertices) + edges.of_corner).T
@@ -152,6 +143,6 @@ def sphere(subdivisions: int = 4) -> Mesh:
             [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))],
             axis=1,
         ).reshape(-1, 3)
-        # on the sphere at once: the next midpoints are then more even
+        # projecting after each subdivision makes the triangles more even
         vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces

@@ -1,4 +1,4 @@
-"""Edges, boundary loops, Euler characteristic and corner gluing of triangle meshes."""
+"""Edges, boundary loops, connected components and cuts of triangle meshes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from scipy.sparse.csgraph import connected_components
 class Edges:
     """Undirected edges of a mesh.
 
-    pairs (E,2) sorted vertex pairs; of_corner (F,3) edge from corner k to corner k+1 of a face;
-    count (E,) how many faces use the edge.
+    Attributes:
+        pairs: (E, 2) vertices of each edge, the smaller first.
+        of_corner: (F, 3) the edge from corner k to corner k + 1 of each face.
+        count: (E,) how many faces use the edge.
     """
 
     pairs: np.ndarray
@@ -23,7 +25,7 @@ class Edges:
 
 
 def edges_of(faces: np.ndarray) -> Edges:
-    """The edges of faces (F,3)."""
+    """The edges of faces (F, 3), sorted by their vertices."""
     directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     ordered = np.sort(directed, axis=1)
     base = int(faces.max()) + 1 if len(faces) else 1
@@ -35,9 +37,11 @@ def edges_of(faces: np.ndarray) -> Edges:
 
 
 def adjacent_faces(edges: Edges, keep: np.ndarray | None = None) -> np.ndarray:
-    """Corner pairs (N,2): flat corner indices 3f+k of the two uses of each two-face edge.
+    """The two corners 3f + k (N, 2) at which each edge with two faces starts.
 
-    Only edges with keep[e] true, when given.
+    Args:
+        edges: the edges of the mesh.
+        keep: (E,) mask of the edges to look at; default all.
     """
     flat = edges.of_corner.ravel()
     order = np.argsort(flat, kind="stable")
@@ -50,7 +54,7 @@ def adjacent_faces(edges: Edges, keep: np.ndarray | None = None) -> np.ndarray:
 
 
 def face_components(faces: np.ndarray) -> np.ndarray:
-    """Component label (F,) of each face; faces that share a vertex belong together."""
+    """Connected component (F,) of each face, from 0; faces that share a vertex are connected."""
     n = int(faces.max()) + 1
     i = np.concatenate([faces[:, 0], faces[:, 1]])
     j = np.concatenate([faces[:, 1], faces[:, 2]])
@@ -60,18 +64,24 @@ def face_components(faces: np.ndarray) -> np.ndarray:
 
 
 def cut_along(faces: np.ndarray, is_cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a mesh open along the edges with is_cut (E,) true, edges numbered as in edges_of.
+    """Cut a mesh open along edges.
 
-    Each vertex gets one copy for every fan of faces that still hangs together around it, so that
-    a vertex whose faces only touch at the point is split even if nothing is cut. Returns the new
-    faces (F,3) and, for each new vertex, its old index (sorted by it).
+    Each vertex gets one copy per fan of faces that remains connected around it; so non-manifold
+    vertices are split even if nothing is cut.
+
+    Args:
+        faces: (F, 3).
+        is_cut: (E,) mask of the edges to cut, in the order of :func:`edges_of`.
+
+    Returns:
+        The new faces (F, 3), and the old index of each new vertex, in rising order.
     """
     edges = edges_of(faces)
     pairs = adjacent_faces(edges, ~is_cut)
     face, corner = pairs // 3, pairs % 3
     following = face * 3 + (corner + 1) % 3
     flat = faces.ravel()
-    # glue the two corners at each end of the edge, whichever way round the second face runs
+    # connect the two corners at each end of the edge, for both orientations of the second face
     i, j = pairs.T
     same = flat[i] == flat[j]
     a = np.concatenate([i, following[:, 0]])
@@ -88,9 +98,11 @@ def cut_along(faces: np.ndarray, is_cut: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """Boundary loops of an oriented manifold mesh, each an array of vertices in the order in which
-    the faces run along them (counter-clockwise for a counter-clockwise flat mesh), longest (by
-    number of vertices) first."""
+    """Boundary loops of an oriented manifold mesh, those with most vertices first.
+
+    Each is an array of vertices in the direction of the faces: counter-clockwise for a planar mesh
+    of counter-clockwise faces.
+    """
     edges = edges_of(faces)
     face, corner = np.nonzero(edges.count[edges.of_corner] == 1)
     tails, heads = faces[face, corner], faces[face, (corner + 1) % 3]
@@ -107,12 +119,12 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def euler_characteristic(faces: np.ndarray) -> int:
-    """V - E + F over the vertices that faces use."""
+    """V - E + F, over the vertices that the faces use."""
     return len(np.unique(faces)) - len(edges_of(faces).pairs) + len(faces)
 
 
 def is_disc(faces: np.ndarray) -> bool:
-    """One component, Euler characteristic 1 and one boundary loop."""
+    """Whether a mesh has one component, one boundary loop and Euler characteristic 1."""
     return (
         int(face_components(faces).max()) == 0
         and euler_characteristic(faces) == 1
@@ -121,8 +133,10 @@ def is_disc(faces: np.ndarray) -> bool:
 
 
 def renumbered(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of n vertices, those (N,) that faces (F, 3) name, in rising order, and the number (n,) of
-    each among them; of the others it means nothing."""
+    """The vertices (N,) of n that faces (F, 3) use, and the new index (n,) of each.
+
+    The new index of an unused vertex has no meaning.
+    """
     used = np.zeros(n, dtype=bool)
     used[faces] = True
     return np.flatnonzero(used), np.cumsum(used) - 1

@@ -1,4 +1,4 @@
-"""The report: what is on the page against the runs themselves, and the page in a real browser."""
+"""The report: its content compared with the runs, and the page in a browser."""
 
 import base64
 import gzip
@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nsm.commands import report
 from nsm.config import compose_config
+from nsm.errors import NsmError
 from nsm.pipeline import run
 from nsm.results import load_surface
 from nsm.results.report import write_report
@@ -33,12 +35,12 @@ TINY = [
 ]
 HOSTILE = "<img src=x onerror=window.pwned=1> %{x} <b>bold<"
 
-PATIENCE = 180  # seconds; a busy machine draws slowly without a GPU
+TIMEOUT = 180  # seconds; drawing without a GPU is slow
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Path:
-    """Two overfits as a sweep, a flattening and a map; runs interrupted, damaged and failed."""
+    """A sweep of two overfits, a flattening and a map; interrupted, damaged and failed runs."""
     folder = tmp_path_factory.mktemp("runs")
     sweep = folder / "sweep"
     for name, activation in ((HOSTILE, "silu"), ("1", "relu")):
@@ -73,25 +75,25 @@ def task(page: Path, name: str) -> dict:
     return next(one for one in content(page)["tasks"] if one["name"] == name)
 
 
-def unpacked(words: dict, index: int) -> np.ndarray:
-    stored = words["arrays"][index]
+def unpacked(content: dict, index: int) -> np.ndarray:
+    stored = content["arrays"][index]
     return np.frombuffer(base64.b64decode(stored["data"]), "<" + stored["type"])
 
 
 def test_figures_and_settings_are_those_of_the_runs(runs, page):
     overfit = task(page, "overfit")
-    assert overfit["differing"][0] == "activation.name"
+    assert overfit["differing"][0] == "activation"
     assert {one["label"] for one in overfit["runs"]} >= {"activation=silu", "activation=relu"}
     for one in overfit["runs"]:
-        words = json.loads((runs / one["name"] / "metrics.json").read_text())
-        assert one["figures"].items() >= words["metrics"].items()
+        stored = json.loads((runs / one["name"] / "metrics.json").read_text())
+        assert one["figures"].items() >= stored["metrics"].items()
         assert one["figures"]["steps"] == 20
     flat = task(page, "param")["runs"][0]["figures"]
-    words = json.loads((runs / "flat" / "metrics.json").read_text())["metrics"]
-    ours = words["nsm"]
+    maps = json.loads((runs / "flat" / "metrics.json").read_text())["metrics"]
+    ours = maps["nsm"]
     assert flat.pop("certified") == {True: "yes", False: "no"}[ours.pop("certified")]
     assert flat.items() >= ours.items()
-    assert flat["SLIM (libigl): area_median"] == words["SLIM (libigl)"]["area_median"]
+    assert flat["SLIM (libigl): area_median"] == maps["SLIM (libigl)"]["area_median"]
 
 
 def test_figures_of_a_collection_are_the_means_of_its_pairs(runs, tmp_path):
@@ -157,16 +159,16 @@ def test_histograms_are_the_distortion_of_the_triangles(runs, page):
 
 
 def test_shapes_are_those_of_the_runs_and_shared_arrays_are_stored_once(runs, page):
-    words = content(page)
-    overfit = next(one for one in words["tasks"] if one["name"] == "overfit")
+    shown = content(page)
+    overfit = next(one for one in shown["tasks"] if one["name"] == "overfit")
     for one in overfit["runs"]:
         phi = load_surface(runs / one["name"])
         shape = one["shapes"][0]
-        vertices = unpacked(words, shape["vertices"]).reshape(-1, 3)
+        vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
         assert np.allclose(vertices, phi(phi.surface.uv), atol=1e-5)
-        assert np.array_equal(unpacked(words, shape["faces"]).reshape(-1, 3), phi.surface.faces)
+        assert np.array_equal(unpacked(shown, shape["faces"]).reshape(-1, 3), phi.surface.faces)
     assert len({one["shapes"][0]["faces"] for one in overfit["runs"]}) == 1
-    mapped = next(one for one in words["tasks"] if one["name"] == "pair_map")["runs"][0]
+    mapped = next(one for one in shown["tasks"] if one["name"] == "pair_map")["runs"][0]
     assert [shape["name"] for shape in mapped["shapes"]] == ["mapped onto the target", "source"]
 
 
@@ -184,50 +186,90 @@ def test_incomplete_and_damaged_runs_are_listed(runs, page, tmp_path):
     shutil.copytree(runs / "sweep" / "1", tmp_path / "worse")
     (tmp_path / "worse" / "config.yaml").write_text("a: [")
     write_report([tmp_path], tmp_path / "report.html")
-    words = content(tmp_path / "report.html")
-    told = [f"{item['name']}: {item['reason']}" for item in words["incomplete"]]
+    shown = content(tmp_path / "report.html")
+    lines = [f"{item['name']}: {item['reason']}" for item in shown["incomplete"]]
     for part in ("surface.safetensors", "error.png", "metrics.csv", "worse: config.yaml"):
-        assert any(part in line for line in told), part
-    assert [one["name"] for one in words["tasks"][0]["runs"]] == ["bad"]
+        assert any(part in line for line in lines), part
+    assert [one["name"] for one in shown["tasks"][0]["runs"]] == ["bad"]
 
 
-def test_a_fine_mesh_is_coarsened_for_the_page(runs, monkeypatch, tmp_path):
+def test_a_fine_mesh_is_decimated_for_the_page(runs, monkeypatch, tmp_path):
     monkeypatch.setattr("nsm.results.report.shapes._FACES", 100)
     write_report([runs / "sweep" / "1"], tmp_path / "report.html")
-    words = content(tmp_path / "report.html")
+    shown = content(tmp_path / "report.html")
     phi = load_surface(runs / "sweep" / "1")
-    shape = words["tasks"][0]["runs"][0]["shapes"][0]
-    vertices = unpacked(words, shape["vertices"]).reshape(-1, 3)
-    faces = unpacked(words, shape["faces"]).reshape(-1, 3)
+    shape = shown["tasks"][0]["runs"][0]["shapes"][0]
+    vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
+    faces = unpacked(shown, shape["faces"]).reshape(-1, 3)
     assert 50 < len(faces) <= 100 < len(phi.surface.faces)
     known = phi(phi.surface.uv)
     assert all(np.abs(known - vertex).max(axis=1).min() < 1e-5 for vertex in vertices[::7])
     for colour in shape["colours"].values():
         count = len(faces) if colour["of"] == "faces" else len(vertices)
-        assert len(unpacked(words, colour["values"])) == count
+        assert len(unpacked(shown, colour["values"])) == count
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("folder", "output", "error"),
     [
-        (["nowhere"], "nowhere"),
-        (["empty"], "no run"),
-        ([], "FOLDER"),
-        (["empty", "--outptu=x"], "--outptu"),
-        (["empty", "-o", "nowhere/report.html"], "nowhere"),
-        (["empty", "-o", "empty"], "is a folder"),
+        ("nowhere", "report.html", ("missing_folder", "nowhere")),
+        ("empty", "report.html", ("no_runs", "empty")),
+        ("empty", "nowhere/report.html", ("missing_folder", "nowhere/report.html")),
+        ("empty", "empty", ("not_a_file", "empty")),
     ],
 )
-def test_bad_words_are_one_line_and_status_2(tmp_path, here, words, expected):
+def test_wrong_folders_and_outputs(tmp_path, monkeypatch, folder, output, error):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
-    result = here("report", *words)
-    assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert expected in result.stderr
+    with pytest.raises(NsmError) as caught:
+        write_report([Path(folder)], Path(output))
+    assert (caught.value.kind, caught.value.key) == error
     assert list(tmp_path.rglob("*.html")) == []
 
 
-def test_the_command_writes_the_page_and_says_where(runs, tmp_path, here):
+@pytest.mark.parametrize("words", [[], ["nowhere"], ["nowhere", "--outptu=x"]])
+def test_wrong_words_are_one_line_and_status_2(here, words):
+    result = here("report", *words)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_trusted_modules_reach_the_loaders(runs, tmp_path, monkeypatch):
+    given = []
+
+    def load(folder, trust=()):
+        given.append(list(trust))
+        raise NsmError("not loaded")
+
+    monkeypatch.setattr("nsm.results.report.shapes.load_surface", load)
+    output = tmp_path / "report.html"
+    report.main([str(runs / "sweep" / "1"), "-o", str(output), "--trust=a", "--trust", "b.c, d"])
+    assert given == [["a", "b.c", "d"]]
+    assert [item["reason"] for item in content(output)["incomplete"]] != []
+
+
+def test_settings_are_named_by_their_group(runs, tmp_path):
+    """The class of a group stands for the group, and its parameters are left out of labels."""
+    targets = {"1": ("nsm.maps.activations.Softplus", 10.0), "2": ("mine.Bump", 3.0)}
+    for name, (target, beta) in targets.items():
+        shutil.copytree(runs / "sweep" / "1", tmp_path / name)
+        config = {
+            "task": {"_target_": "nsm.pipeline.overfit.OverfitTask", "name": "overfit"},
+            "activation": {"_target_": target, "beta": beta},
+            "optimizer": {"lr": 0.1},
+        }
+        (tmp_path / name / "config.yaml").write_text(json.dumps(config))
+    write_report([tmp_path], tmp_path / "report.html")
+    shown = task(tmp_path / "report.html", "overfit")
+    assert shown["differing"] == ["activation", "activation.beta"]
+    assert [one["label"] for one in shown["runs"]] == [
+        "activation=Softplus",
+        "activation=mine.Bump",
+    ]
+    assert shown["runs"][0]["settings"]["optimizer.lr"] == 0.1
+
+
+def test_the_command_writes_the_page_and_prints_its_path(runs, tmp_path, here):
     result = here("report", str(runs / "sweep" / "1"))
     assert result.returncode == 0, result.stderr
     assert result.stdout.strip() == "1 run: report.html"
@@ -265,7 +307,7 @@ def browser(page):
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     service = webdriver.ChromeService(driver)
     window = webdriver.Chrome(options=options, service=service)
-    window.set_script_timeout(PATIENCE)
+    window.set_script_timeout(TIMEOUT)
     try:
         window.get(page.as_uri())
         until(window, "return document.documentElement.dataset.state === 'ready'")
@@ -279,7 +321,7 @@ def browser(page):
 def until(window, question: str) -> None:
     start = time.monotonic()
     while not window.execute_script(question):
-        assert time.monotonic() - start < PATIENCE, question
+        assert time.monotonic() - start < TIMEOUT, question
         time.sleep(0.1)
 
 
@@ -303,7 +345,7 @@ def names(window) -> list[str]:
     )
 
 
-def test_the_page_loads_nothing_and_complains_of_nothing(browser, page):
+def test_the_page_loads_nothing_and_logs_no_errors(browser, page):
     until(browser, "return document.querySelectorAll('#shapes canvas').length >= 2")
     log = [json.loads(line["message"])["message"] for line in browser.get_log("performance")]
     asked = [
@@ -336,12 +378,12 @@ def test_the_table_sorts_and_filters(browser):
     assert names(browser) == rising[::-1]
     assert set(rising) == {"activation=silu", "activation=relu"}
     click(browser, key)
-    type_into(browser, "thead input[aria-label='filter activation.name']", "RELU")
+    type_into(browser, "thead input[aria-label='filter activation']", "RELU")
     assert names(browser) == ["activation=relu"]
-    # what is filtered out leaves the plots as well
+    # filters apply to the plots as well
     plotted = "return document.querySelector('#curves .plot').data.map(x => x.name)"
     assert browser.execute_script(plotted) == ["activation=relu"]
-    type_into(browser, "thead input[aria-label='filter activation.name']", "")
+    type_into(browser, "thead input[aria-label='filter activation']", "")
     type_into(browser, "thead input[aria-label='filter RMS distance']", "< 0")
     assert names(browser) == []
     type_into(browser, "thead input[aria-label='filter RMS distance']", ">= 0")
@@ -353,7 +395,7 @@ def test_the_table_sorts_and_filters(browser):
     assert len(browser.execute_script(plotted)) == 2
 
 
-def test_a_shape_is_seen_and_turns_with_its_neighbours(browser):
+def test_views_show_shapes_and_rotate_together(browser):
     until(browser, "return document.querySelectorAll('#shapes canvas').length >= 2")
     view = browser.find_element("css selector", "#shapes .view")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", view)
@@ -378,7 +420,7 @@ def picture(element) -> np.ndarray:
     return np.asarray(image, dtype=float)
 
 
-def test_other_tasks_and_what_is_damaged_are_on_the_page(browser):
+def test_other_tasks_and_damaged_runs_are_on_the_page(browser):
     click(browser, "#tasks button[data-name=param]")
     until(browser, "return document.querySelectorAll('#shapes .view').length === 1")
     shapes = "return [...document.querySelectorAll('#shapes select')[0].options].map(x => x.value)"

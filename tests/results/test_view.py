@@ -1,4 +1,4 @@
-"""The viewer: rays, places and colours against closed forms, and a server that is clicked on."""
+"""The viewer: picking and colours against closed forms, and clicks on a running server."""
 
 import json
 import socket
@@ -13,6 +13,7 @@ import torch
 import trimesh
 
 from nsm.domains import Surface
+from nsm.errors import NsmError
 from nsm.maps import Rotated, build_planar
 from nsm.results import (
     NeuralSurface,
@@ -24,8 +25,8 @@ from nsm.results import (
 )
 from nsm.results.analytic import analytic_surface
 from nsm.results.view.glb import as_glb
-from nsm.results.view.picking import hit, pick, picked
-from nsm.results.view.scene import PLAIN, POSITION, UPS, Paint, scene_of
+from nsm.results.view.picking import hit, pick, pick_at
+from nsm.results.view.scene import PLAIN, POSITION, UP_AXES, Paint, scene_of
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import boundary_loops
 
@@ -85,9 +86,9 @@ def still(scene):
     return scene.source.vertices, scene.target.vertices
 
 
-def test_a_ray_meets_the_nearest_triangle_where_it_should():
+def test_a_ray_hits_the_nearest_triangle():
     sheets = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 2], [4, 0, 2], [0, 4, 2.0]])
-    faces = np.array([[0, 1, 2], [3, 5, 4]])  # the second turned the other way round
+    faces = np.array([[0, 1, 2], [3, 5, 4]])  # the second has the opposite orientation
     distance, place = hit(np.array([1, 1, 5.0]), np.array([0, 0, -2.0]), sheets, faces)
     assert (distance, place.face[0]) == (1.5, 1)
     assert place.take(sheets, faces)[0] == pytest.approx([1, 1, 2])
@@ -99,7 +100,7 @@ def test_a_ray_meets_the_nearest_triangle_where_it_should():
     assert hit(np.array([-1, 1, 0.0]), np.array([1.0, 0, 0]), sheets, faces) is None  # edge-on
 
 
-def test_no_ray_slips_through_an_edge(closed):
+def test_rays_through_edges_hit(closed):
     s = closed.surface
     middle = s.vertices[s.faces].mean(axis=1).mean(axis=0)
     edges = s.vertices[s.faces[:, :2]].mean(axis=1)
@@ -116,11 +117,11 @@ def test_a_picked_point_and_its_image_correspond(f, side):
     at = [place.take(shape.vertices, shape.faces)[0] for place, shape in ends]
     origin, direction = towards(scene, side, seen(scene, side))
     assert at[side] + scene.offsets[side] == pytest.approx(origin + direction, abs=1e-9)
-    assert f(found.own[0][None])[0] == pytest.approx(found.own[1], abs=1e-9)
+    assert f(found.coordinates[0][None])[0] == pytest.approx(found.coordinates[1], abs=1e-9)
     assert f.planar(found.uv[:1])[0] == pytest.approx(found.uv[1], abs=1e-9)
-    # as it is shown, the target is only moved
+    # the displayed target is only translated
     t = f.target.surface
-    posed = f.aligned((found.own[1][None] - t.center) * t.scale)[0]
+    posed = f.aligned((found.coordinates[1][None] - t.center) * t.scale)[0]
     assert at[1] - posed == pytest.approx(scene.target.vertices[0] - f.aligned(t.vertices)[0])
 
 
@@ -150,7 +151,7 @@ def test_a_morphed_shape_is_picked_where_it_is(f):
     found = pick(scene, *ray, shown)
     at = found.places[0].take(shown[0], scene.source.faces)[0]
     assert at + scene.offsets[0] == pytest.approx(sum(ray), abs=1e-9)
-    # it has the shape of the target now: a point lies on its own image but for the chords
+    # now it has the shape of the target: a point is its own image, up to the triangles' chords
     image = found.places[1].take(scene.target.vertices, scene.target.faces)[0]
     assert np.linalg.norm(at - image) < 0.02
 
@@ -161,40 +162,40 @@ def test_seams_are_the_edges_that_were_cut(closed, f):
     assert 2 * len(shape.seam) == len(loop)
     assert set(shape.seam.ravel()) <= set(loop)
     assert len(scene_of(f).source.seam) == 0
-    # and shading does not show them
+    # the normals are continuous across them
     normals = shape.normals(shape.vertices)
     assert normals[shape.seam_pairs[:, 0]] == pytest.approx(normals[shape.seam_pairs[:, 1]])
     outward = shape.vertices / np.linalg.norm(shape.vertices, axis=1)[:, None]
     assert (normals * outward).sum(axis=1).min() > 0.99
 
 
-def test_points_are_told_in_the_units_of_the_file(closed):
+def test_coordinates_are_in_the_units_of_the_file(closed):
     scene = scene_of(closed)
-    found = picked(scene, 0, Places(np.array([7]), np.array([[1.0, 0, 0]])))
-    assert np.linalg.norm(found.own[0] - 5) == pytest.approx(3)
+    found = pick_at(scene, 0, Places(np.array([7]), np.array([[1.0, 0, 0]])))
+    assert np.linalg.norm(found.coordinates[0] - 5) == pytest.approx(3)
 
 
 def test_a_point_and_its_image_have_one_colour(f):
     scene = scene_of(f)
     board = scene.paint("checkerboard of the target")
-    assert board[0].board is f.image_uv
-    # but for the rim, where the source's chords lie aside of the target's
-    assert board[1].board == pytest.approx(f.target.surface.uv, abs=1e-3)
-    source = scene.paint("checkerboard of the source")[1].board
+    assert board[0].checkerboard is f.image_uv
+    # except at the boundary, where the chords of source and target differ
+    assert board[1].checkerboard == pytest.approx(f.target.surface.uv, abs=1e-3)
+    source = scene.paint("checkerboard of the source")[1].checkerboard
     assert source == pytest.approx(f.source_uv)
     for name in scene.colourings:
         for paint, shape in zip(scene.paint(name), scene.shapes, strict=True):
-            values = paint.board if paint.colours is None else paint.colours
+            values = paint.checkerboard if paint.colours is None else paint.colours
             assert len(values) == len(shape.vertices) and np.isfinite(values).all()
     colours = scene.paint(POSITION)
-    at = scene.across(1, Places(np.array([40]), np.array([[0.2, 0.3, 0.5]])))
+    at = scene.corresponding(1, Places(np.array([40]), np.array([[0.2, 0.3, 0.5]])))
     there = Places(np.array([40]), np.array([[0.2, 0.3, 0.5]])).take(
         colours[1].colours, scene.target.faces
     )
     assert there == pytest.approx(at.take(colours[0].colours, scene.source.faces), abs=0.02)
 
 
-def test_colours_stand_for_numbers_of_the_scale(f):
+def test_colours_follow_the_scale(f):
     scene = scene_of(f)
     scale = scene.scale("symmetric dirichlet")
     assert scale == (4, 20, True)
@@ -207,7 +208,7 @@ def test_colours_stand_for_numbers_of_the_scale(f):
     assert not log and (low, high) == pytest.approx(np.percentile(values, [1, 98]))
 
 
-@pytest.mark.parametrize("up", UPS)
+@pytest.mark.parametrize("up", UP_AXES)
 def test_the_shapes_stand_side_by_side_before_the_camera(f, closed, up):
     axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
     for scene in (scene_of(f, up), scene_of(closed, up)):
@@ -234,11 +235,13 @@ def test_a_flattening_lies_flat_before_the_viewer(surfaces):
         np.broadcast_to(scene.frame[2], scene.target.vertices.shape)
     )
     place = Places(np.array([11]), np.array([[0.2, 0.5, 0.3]]))
-    found = picked(scene, 0, place)
-    assert found.own[1] == pytest.approx(h(torch.tensor(found.uv[:1]).float())[0].numpy(), abs=1e-5)
-    back = picked(scene, 1, place)
-    assert back.own[0] == pytest.approx(found.own[0], abs=1e-9)
-    board = scene.paint("checkerboard of the plane")[1].board
+    found = pick_at(scene, 0, place)
+    assert found.coordinates[1] == pytest.approx(
+        h(torch.tensor(found.uv[:1]).float())[0].numpy(), abs=1e-5
+    )
+    back = pick_at(scene, 1, place)
+    assert back.coordinates[0] == pytest.approx(found.coordinates[0], abs=1e-9)
+    board = scene.paint("checkerboard of the plane")[1].checkerboard
     assert np.abs(board).max() == pytest.approx(1, abs=1e-6)
 
 
@@ -249,10 +252,10 @@ def test_an_error_is_that_of_the_neural_surface(surfaces):
 
     s = surfaces[0].surface
     scene = scene_of(NeuralSurface(s, Shifted()))
-    found = picked(scene, 0, Places(np.array([3]), np.array([[0.2, 0.5, 0.3]])))
+    found = pick_at(scene, 0, Places(np.array([3]), np.array([[0.2, 0.5, 0.3]])))
     percent = 10 / s.bounding_box_diagonal
     assert found.values["distance, % of diagonal"] == pytest.approx(percent, abs=1e-4)
-    assert found.own[1] - found.own[0] == pytest.approx([0, 0, 0.1], abs=1e-6)
+    assert found.coordinates[1] - found.coordinates[0] == pytest.approx([0, 0, 0.1], abs=1e-6)
 
 
 def test_a_mesh_for_the_browser_has_its_colours_and_normals(closed):
@@ -261,13 +264,13 @@ def test_a_mesh_for_the_browser_has_its_colours_and_normals(closed):
     for paint in (grey, Paint(None, shape.uv)):
         data = as_glb(shape, shape.vertices, paint)
         length, kind = struct.unpack("<I4s", data[12:20])
-        words = json.loads(data[20 : 20 + length])
-        (part,) = words["meshes"][0]["primitives"]
+        gltf = json.loads(data[20 : 20 + length])
+        (part,) = gltf["meshes"][0]["primitives"]
         assert set(part["attributes"]) == {"POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0"}
-        material = words["materials"][part["material"]]
+        material = gltf["materials"][part["material"]]
         assert material["doubleSided"]
         textured = "baseColorTexture" in material["pbrMetallicRoughness"]
-        assert textured == (paint.board is not None)
+        assert textured == (paint.checkerboard is not None)
     mesh = next(
         iter(trimesh.load(trimesh.util.wrap_as_stream(data), file_type="glb").geometry.values())
     )
@@ -302,19 +305,19 @@ def test_a_click_marks_the_point_and_its_image(served, f):
     assert target == pytest.approx(posed + moved, abs=1e-6)
 
     # the source moves under its marker
-    viewer.way.value = 1.0
-    viewer._show_way()
+    viewer.morph.value = 1.0
+    viewer._show_morph()
     at = viewer.picks["red"].places[0].take(viewer.scene.image, s.faces)[0]
     assert np.array(viewer.markers["red"][0].position) == pytest.approx(
         at + viewer.scene.offsets[0], abs=1e-6
     )
-    viewer.way.value = 0.0
-    viewer._show_way()
+    viewer.morph.value = 0.0
+    viewer._show_morph()
     for _ in range(5):
         click(viewer, 1)
     assert list(viewer.markers) == ["blue", "green", "purple", "orange", "red"]
     assert viewer._list.content.startswith("**red**")
-    viewer._forget()
+    viewer._clear_picks()
     assert viewer.markers == {} and viewer._list.content == ""
     viewer.on_click(SimpleNamespace(ray_origin=(0, 0, 99.0), ray_direction=(0, 0, 1.0)))
     assert viewer.picks == {}
@@ -327,11 +330,11 @@ def test_every_choice_of_the_panel_can_be_shown(served):
         viewer._show_shapes()
         assert viewer._bar.visible == (viewer.scene.scale(name) is not None)
     viewer.landmarks.value, viewer.seams.value = True, True
-    viewer._show_marks()
-    names = {mark.name for mark in viewer._marks}
+    viewer._show_overlays()
+    names = {mark.name for mark in viewer._overlays}
     assert names == {"/source/landmarks", "/target/landmarks"}  # open surfaces have no seam
     viewer.up.value = "z"
-    viewer._renew()
+    viewer._rebuild()
     assert viewer.scene.frame[1] @ [0, 0, 1] > 0.5
 
 
@@ -342,8 +345,8 @@ def test_seams_are_drawn_on_both_shapes(closed):
     g = SurfaceMap(closed, closed, turned(0.3), np.zeros((0, 2), dtype=np.int64))
     with serving(g, "127.0.0.1", 0) as (viewer, _):
         viewer.seams.value = True
-        viewer._show_marks()
-        names = {mark.name for mark in viewer._marks}
+        viewer._show_overlays()
+        names = {mark.name for mark in viewer._overlays}
         assert names == {"/source/seam", "/target/seam", "/target/image"}
 
 
@@ -356,20 +359,24 @@ def test_any_pair_of_a_collection_is_chosen(surfaces):
     with serving(group, "127.0.0.1", 0) as (viewer, _):
         click(viewer, 0)
         viewer.ends[1].value = viewer.ends[1].options[2]
-        viewer._choose(1)
+        viewer._choose_pair(1)
         assert [s.name for s in viewer.scene.shapes] == ["sphere_cap", "cone"]
         assert viewer.picks == {}
         click(viewer, 0)
         found = viewer.picks["red"]
-        assert group.pair(0, 2)(found.own[0][None])[0] == pytest.approx(found.own[1], abs=1e-9)
-        # where the other end would be the same, it becomes what this one was
+        assert group.pair(0, 2)(found.coordinates[0][None])[0] == pytest.approx(
+            found.coordinates[1], abs=1e-9
+        )
+        # choosing the same surface twice swaps the two
         viewer.ends[0].value = viewer.ends[0].options[2]
-        viewer._choose(0)
+        viewer._choose_pair(0)
         assert [s.name for s in viewer.scene.shapes] == ["cone", "sphere_cap"]
         assert [end.value for end in viewer.ends] == ["2: cone", "0: sphere_cap"]
 
 
-def test_the_command_says_where_and_ends_quietly(here, surfaces, tmp_path, monkeypatch):
+def test_the_command_prints_the_address_and_ends_without_an_error(
+    here, surfaces, tmp_path, monkeypatch
+):
     pytest.importorskip("viser", reason="needs nsm[view]")
     save_surface(tmp_path / "run", surfaces[0])
 
@@ -386,34 +393,60 @@ def test_the_command_says_where_and_ends_quietly(here, surfaces, tmp_path, monke
         socket.create_connection(("127.0.0.1", port), timeout=1)
 
 
-def test_mistakes_are_told_in_one_line(here, surfaces, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("host", "port", "error"),
+    [
+        ("127.0.0.1", None, ("port_in_use", "port")),
+        ("127.0.0.1", 70000, ("out_of_range", "port")),
+        ("192.0.2.1", 0, ("address_not_available", "host")),
+    ],
+)
+def test_addresses_that_cannot_be_used(f, host, port, error):
     pytest.importorskip("viser", reason="needs nsm[view]")
-    save_surface(tmp_path / "run", surfaces[0])
+    from nsm.results.view import serving
+
     with socket.create_server(("127.0.0.1", 0)) as busy:
-        port = busy.getsockname()[1]
-        cases = {
-            ("view", "elsewhere"): "elsewhere: no such folder",
-            ("view", "run", "--port", str(port)): f"port {port} is in use",
-            ("view", "run", "--port", "70000"): "port 70000",
-            ("view", "run", "--port", "0", "--host", "192.0.2.1"): "192.0.2.1",
-            ("view", "run", "--port", "http"): "--port",
-            ("view",): "FOLDER",
-        }
-        for words, told in cases.items():
-            result = here(*words)
-            assert (result.returncode, result.stdout) == (2, "")
-            (line,) = result.stderr.splitlines()
-            assert told in line
+        port = busy.getsockname()[1] if port is None else port
+        with pytest.raises(NsmError) as caught, serving(f, host, port):
+            pass
+    assert (caught.value.kind, caught.value.key) == error
 
 
-def test_a_missing_viser_is_named(here, monkeypatch):
+@pytest.mark.parametrize(
+    "words", [["elsewhere"], ["elsewhere", "--port", "http"], ["elsewhere", "--trust"], []]
+)
+def test_wrong_words_are_one_line_and_status_2(here, words):
+    pytest.importorskip("viser", reason="needs nsm[view]")
+    result = here("view", *words)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_trusted_modules_reach_the_loader(monkeypatch):
+    pytest.importorskip("viser", reason="needs nsm[view]")
+    from nsm.commands import view
+
+    class Loaded(Exception):
+        pass
+
+    def load(folder, trust=()):
+        raise Loaded(str(folder), list(trust))
+
+    monkeypatch.setattr("nsm.api.load", load)
+    for words in (["--trust", "a.b", "--trust", "c"], ["--trust=a.b, c"]):
+        with pytest.raises(Loaded) as caught:
+            view.main(["run", *words])
+        assert caught.value.args == ("run", ["a.b", "c"])
+
+
+def test_without_viser_the_command_names_the_extra(here, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     result = here("view", "anything")
     assert result.returncode == 2
-    assert result.stderr == "nsm: nsm view needs viser: pip install 'nsm[view]'\n"
+    assert "nsm[view]" in result.stderr
 
 
-def test_no_page_may_put_the_server_on_the_internet(served):
+def test_the_page_cannot_publish_the_server(served):
     viewer, _ = served
     started = time.monotonic()
     assert viewer.server.request_share_url() is None

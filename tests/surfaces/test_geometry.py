@@ -1,4 +1,4 @@
-"""What a mesh hides of itself."""
+"""Ambient occlusion."""
 
 import igl
 import numpy as np
@@ -13,7 +13,7 @@ def arrays(mesh):
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_nothing_is_hidden_on_a_ball_and_all_within_another(size):
+def test_a_sphere_hides_nothing_of_itself_and_all_of_a_sphere_inside(size):
     vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2, radius=size))
     assert (ambient_occlusion(vertices, faces) == 0).all()
     outer = trimesh.creation.icosphere(subdivisions=2, radius=2 * size)
@@ -22,7 +22,7 @@ def test_nothing_is_hidden_on_a_ball_and_all_within_another(size):
     assert (hidden[: len(vertices)] == 1).all() and (hidden[len(vertices) :] == 0).all()
 
 
-def test_it_comes_again_and_is_what_libigl_finds_in_directions_drawn_anew():
+def test_occlusion_is_reproducible_and_agrees_with_libigl():
     vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=3))
     vertices[:, 2] += 3 * vertices[:, 0] ** 2  # a bowl
     found = ambient_occlusion(vertices, faces)

@@ -1,4 +1,4 @@
-"""Points found on meshes."""
+"""Nearest points on meshes."""
 
 import numpy as np
 from hypothesis import given
@@ -24,7 +24,7 @@ def test_a_point_of_a_triangle_is_found_there(seed):
     assert (places.face[inside] == face[inside]).all()
 
 
-def test_points_outside_go_to_the_nearest_place():
+def test_points_outside_go_to_the_nearest_point():
     uv, faces = shapes.grid_mesh(5)
     places = locate(np.array([[2.0, 0.25], [-3.0, 3.0]]), uv, faces)
     assert np.abs(places.take(uv, faces) - [[1, 0.25], [-1, 1]]).max() < 1e-12

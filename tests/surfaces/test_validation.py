@@ -1,4 +1,4 @@
-"""Repairs that keep the shape, and refusals in one line."""
+"""Repairs that keep the shape, and the kinds of errors for other meshes."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def soup(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def with_midpoints(parts: int) -> tuple[np.ndarray, np.ndarray]:
-    """A tetrahedron, one side of face 0 split into parts on that face only: a fan of slivers."""
+    """A tetrahedron with one edge of face 0 split on that face only: degenerate triangles."""
     vertices, faces = TETRAHEDRON
     steps = np.linspace(0, 1, parts + 1)[1:-1, None]
     points = (1 - steps) * vertices[0] + steps * vertices[2]
@@ -36,10 +36,10 @@ def with_midpoints(parts: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("parts", [2, 3, 6])
-def test_slivers_are_flipped_away_without_a_hole(parts):
+def test_degenerate_triangles_are_flipped_without_a_hole(parts):
     vertices, faces = with_midpoints(parts)
     mesh = clean(vertices, faces)
-    assert f"{parts - 1} zero-area faces removed by edge flips" in mesh.log
+    assert f"{parts - 1} degenerate triangles removed by edge flips" in mesh.log
     assert len(mesh.faces) == len(faces)
     assert topology.euler_characteristic(mesh.faces) == 2
     assert topology.boundary_loops(mesh.faces) == []
@@ -50,52 +50,50 @@ def test_slivers_are_flipped_away_without_a_hole(parts):
     assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(1 / 6)
 
 
-def test_a_sliver_on_the_boundary_is_dropped():
+def test_a_degenerate_triangle_on_the_boundary_is_removed():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]])
     mesh = clean(vertices, np.array([[0, 3, 2], [3, 1, 2], [0, 1, 3]]))
-    assert "1 zero-area faces removed" in mesh.log
+    assert "1 degenerate triangles removed" in mesh.log
     assert len(mesh.faces) == 2
 
 
-def test_unreferenced_vertices_are_told_beside_merged_ones():
+def test_unreferenced_and_duplicate_vertices_are_logged():
     vertices, faces = soup(*ball())
     mesh = clean(np.vstack([vertices, [[9.0, 9, 9]]]), faces)
     assert "1 unreferenced vertices removed" in mesh.log
-    assert any("coincident vertices merged" in line for line in mesh.log)
+    assert any("duplicate vertices welded" in line for line in mesh.log)
     assert mesh.merged[-1] == -1
-    # each given vertex knows where it went
     assert np.allclose(mesh.vertices[mesh.merged[:-1]], vertices)
     assert np.allclose(mesh.vertices, vertices[mesh.source_vertex])
 
 
-def test_crumbs_are_dropped_and_told():
+def test_small_components_are_removed():
     vertices, faces = ball()
     crumb, crumb_faces = TETRAHEDRON
     mesh = clean(
         np.vstack([vertices, 0.1 * crumb + 3]), np.vstack([faces, crumb_faces + len(vertices)])
     )
     assert len(mesh.faces) == len(faces)
-    assert any("small separate parts dropped" in line for line in mesh.log)
+    assert any("small connected components removed" in line for line in mesh.log)
     assert (mesh.merged[-4:] == -1).all()
 
 
-def test_a_pinched_vertex_is_split():
-    """Two far vertices of a torus made one: the surface is a torus again once it is doubled."""
+def test_a_non_manifold_vertex_is_split():
+    """A torus with two far vertices merged."""
     vertices, faces = catalogue_mesh("torus")
     pinched = faces.copy()
     pinched[pinched == 1024] = 0
     mesh = clean(vertices, pinched)
-    assert any("touch at a point" in line for line in mesh.log)
+    assert any("non-manifold vertices split" in line for line in mesh.log)
     assert topology.euler_characteristic(mesh.faces) == 0
 
 
-def test_sheets_that_coincide_are_left_apart():
-    """Merged, the rim of the lid would have three faces at an edge."""
+def test_duplicates_whose_welding_would_make_an_edge_non_manifold_are_kept():
     quad = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]])
     wing = np.array([[1.0, 0, 0], [1, 1, 0], [1, 0, 0.01], [1, 1, 0.01]])
     faces = [[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2], [6, 8, 9], [6, 9, 7]]
     mesh = clean(np.vstack([quad, wing]), np.array(faces))
-    assert any("left apart" in line for line in mesh.log)
+    assert any("duplicate vertices kept" in line for line in mesh.log)
     assert len(mesh.faces) == 4
 
 
@@ -111,7 +109,7 @@ def moebius() -> tuple[np.ndarray, np.ndarray]:
     faces = []
     for i in range(n - 1):
         faces += [(i, i + 1, n + i + 1), (i, n + i + 1, n + i)]
-    faces += [(n - 1, n, 0), (n - 1, 0, 2 * n - 1)]  # the last pair is crossed over
+    faces += [(n - 1, n, 0), (n - 1, 0, 2 * n - 1)]  # the last pair crosses over
     return np.vstack(rows), np.array(faces)
 
 
@@ -131,7 +129,7 @@ def twice() -> tuple[np.ndarray, np.ndarray]:
     return np.vstack([vertices, vertices + 3]), np.vstack([faces, faces + len(vertices)])
 
 
-def renumbered(number: int) -> tuple[np.ndarray, np.ndarray]:
+def with_index(number: int) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = ball()
     faces[3, 1] = number
     return vertices, faces
@@ -141,34 +139,38 @@ NOTHING = np.zeros((0, 3))
 
 
 @pytest.mark.parametrize(
-    ("mesh", "words"),
+    ("mesh", "kind"),
     [
-        (with_value(np.nan), "vertex 7 is NaN"),
-        (with_value(np.inf), "vertex 7 is NaN or infinite"),
-        (fin(), "non-manifold edge"),
-        (soup(*fin()), "non-manifold edge"),
-        (twice(), "2 separate parts"),
-        (moebius(), "one-sided"),
-        (renumbered(10_000), "names vertex 10000"),
-        (renumbered(-1), "names vertex -1"),
-        ((NOTHING, NOTHING.astype(int)), "no 3D vertices"),
-        ((ball()[0], NOTHING.astype(int)), "no faces"),
-        ((ball()[0], np.zeros((2, 4), int)), r"faces of shape \(2, 4\)"),
-        ((ball()[0][:, :2], ball()[1]), r"vertices of shape \(\d+, 2\)"),
-        ((np.zeros((4, 3)), TETRAHEDRON[1]), "zero area"),
-        ((TETRAHEDRON[0], np.array([[0, 0, 1], [2, 2, 3]])), "zero area"),
-        ((ball()[0] * [1, 0, 0], ball()[1]), "zero area"),
+        (with_value(np.nan), "not_finite"),
+        (with_value(np.inf), "not_finite"),
+        (fin(), "non_manifold"),
+        (soup(*fin()), "non_manifold"),
+        (twice(), "disconnected"),
+        (moebius(), "not_orientable"),
+        (with_index(10_000), "out_of_range"),
+        (with_index(-1), "out_of_range"),
+        ((NOTHING, NOTHING.astype(int)), "not_a_mesh"),
+        ((ball()[0], NOTHING.astype(int)), "not_a_mesh"),
+        ((ball()[0], np.zeros((2, 4), int)), "wrong_shape"),
+        ((ball()[0][:, :2], ball()[1]), "wrong_shape"),
+        ((ball()[0].astype(str), ball()[1]), "wrong_type"),
+        ((ball()[0], ball()[1] + 0.5), "wrong_type"),
+        ((np.zeros((4, 3)), TETRAHEDRON[1]), "degenerate"),
+        ((TETRAHEDRON[0], np.array([[0, 0, 1], [2, 2, 3]])), "degenerate"),
+        ((ball()[0] * [1, 0, 0], ball()[1]), "degenerate"),
+        ((ball()[0] * 1e40, ball()[1]), "out_of_range"),
+        ((ball()[0] * 1e-40, ball()[1]), "out_of_range"),
     ],
 )
-def test_what_needs_a_decision_is_refused_in_one_line(mesh, words):
-    with pytest.raises(NsmError, match=words) as caught:
+def test_other_meshes_are_refused(mesh, kind):
+    with pytest.raises(NsmError) as caught:
         clean(*mesh, "shape")
-    assert str(caught.value).startswith("shape: ")
+    assert (caught.value.kind, caught.value.key) == (kind, "shape")
     assert "\n" not in str(caught.value)
 
 
 def test_small_faces_beside_a_long_spike_are_kept():
-    """Their area is nothing beside the square of the diagonal, but they are the shape."""
+    """Their area is tiny relative to the square of the diagonal."""
     vertices, faces = ball()
     vertices[5] *= 1e7
     mesh = clean(vertices, faces)
@@ -176,7 +178,7 @@ def test_small_faces_beside_a_long_spike_are_kept():
     assert mesh.log == ()
 
 
-def test_a_vertex_that_was_written_down_twice_is_joined_without_a_hole():
+def test_neighbours_at_one_place_are_welded_without_a_hole():
     vertices, faces = ball()
     corner = faces[0, 0]
     twin = len(vertices)
@@ -186,14 +188,7 @@ def test_a_vertex_that_was_written_down_twice_is_joined_without_a_hole():
     faces[first][faces[first] == corner] = twin
     faces = np.vstack([faces, [(corner, p, twin), (twin, q, corner)]])
     mesh = clean(np.vstack([vertices, vertices[corner] + 1e-15]), faces)
-    assert any("neighbours at no distance" in line for line in mesh.log)
+    assert any("edges of zero length" in line for line in mesh.log)
     assert topology.euler_characteristic(mesh.faces) == 2
     assert topology.boundary_loops(mesh.faces) == []
     assert mesh.merged[twin] == mesh.merged[corner]
-
-
-@pytest.mark.parametrize(("scale", "word"), [(1e40, "too large"), (1e-40, "too small")])
-def test_what_single_precision_cannot_hold_is_refused(scale, word):
-    vertices, faces = ball()
-    with pytest.raises(NsmError, match=word):
-        clean(scale * vertices, faces)

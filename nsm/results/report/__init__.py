@@ -13,22 +13,37 @@ from nsm.results.report.runs import find_runs
 
 
 def write_report(
-    folders: Sequence[Path], output: Path, title: str = "nsm report"
+    folders: Sequence[Path],
+    output: Path,
+    title: str = "nsm report",
+    trust: Sequence[str] = (),
 ) -> tuple[int, int]:
-    """Write the page on all runs in folders, however deep; how many are complete and not.
+    """Write one page about all runs in folders and their subfolders.
+
+    Args:
+        folders: to search for runs.
+        output: the HTML file.
+        title: of the page.
+        trust: modules outside nsm whose code the files of the runs may name.
+
+    Returns:
+        The numbers of complete and of incomplete runs.
 
     Raises:
-        NsmError: a folder that is not there, folders without any run, a page that cannot be
-            written.
+        NsmError: ``missing_folder`` or ``no_runs`` (key: the folder), ``not_a_file`` or
+            ``not_writable`` (key: the output).
     """
     if not output.parent.is_dir():
-        raise NsmError(f"{output}: there is no folder {output.parent}; make it first")
+        reason = f"{output}: there is no folder {output.parent}; create it first"
+        raise NsmError(reason, kind="missing_folder", key=str(output))
     if output.is_dir():
-        raise NsmError(f"{output} is a folder; give a file name for the page")
+        reason = f"{output}: is a folder; give a file name for the page"
+        raise NsmError(reason, kind="not_a_file", key=str(output))
     runs, incomplete = find_runs(folders)
-    text = page(title, content(title, runs, incomplete))
+    text = page(title, content(title, runs, incomplete, trust))
     try:
         atomic_write(output, text.encode())
     except OSError as error:
-        raise NsmError(f"{output}: {error.strerror}; give another --output") from error
+        reason = f"{output}: {error.strerror}; give another --output"
+        raise NsmError(reason, kind="not_writable", key=str(output)) from error
     return len(runs), len(incomplete)

@@ -1,4 +1,4 @@
-"""What the report shows, as plain words and numbers for the page's script."""
+"""The content of the report, as JSON for the page's script."""
 
 from __future__ import annotations
 
@@ -20,14 +20,17 @@ from nsm.results.tables import FIGURES
 
 _BINS = 60
 _HISTOGRAMS = ("symmetric dirichlet", "singular value ratio", "area")
-_LABEL_SETTINGS = 3  # a run is called by at most so many of the settings that differ
-_HIGHER_IS_BETTER = ("covered_percent",)
-_ZERO_IS_BEST = ("normal_variation_excess_degrees",)
-_NEITHER = ("steps", "certified")
+_LABEL_SETTINGS = 3  # at most, of the settings that differ, in the label of a run
+_BEST = {
+    "covered_percent": "high",
+    "normal_variation_excess_degrees": "zero",
+    "steps": "none",
+    "certified": "none",
+}  # of the figures for which it is not the lowest value
 
 
 class _Arrays:
-    """Arrays of the page, each of which is stored once however many shapes use it."""
+    """The arrays of the page; shapes that use the same array share it."""
 
     def __init__(self) -> None:
         self.stored: list[dict[str, str]] = []
@@ -47,41 +50,48 @@ class _Arrays:
         return self._known[key]
 
 
-def content(title: str, runs: Sequence[Run], incomplete: Sequence[Incomplete]) -> dict[str, Any]:
-    """Everything on the page; what of a run cannot be read is listed beside incomplete runs."""
+def content(
+    title: str, runs: Sequence[Run], incomplete: Sequence[Incomplete], trust: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Everything on the page. Files that cannot be read are listed with the incomplete runs."""
     arrays = _Arrays()
-    aside = [{"name": item.name, "reason": item.reason} for item in incomplete]
+    remarks = [{"name": item.name, "reason": item.reason} for item in incomplete]
     tasks = []
     for task in sorted({run.task for run in runs}):
         of_task = [run for run in runs if run.task == task]
-        tasks.append(_task(task, of_task, arrays, aside))
-    return {"title": title, "tasks": tasks, "incomplete": aside, "arrays": arrays.stored}
+        tasks.append(_task(task, of_task, arrays, remarks, trust))
+    return {"title": title, "tasks": tasks, "incomplete": remarks, "arrays": arrays.stored}
 
 
 def _task(
-    task: str, runs: Sequence[Run], arrays: _Arrays, aside: list[dict[str, str]]
+    task: str,
+    runs: Sequence[Run],
+    arrays: _Arrays,
+    remarks: list[dict[str, str]],
+    trust: Sequence[str],
 ) -> dict[str, Any]:
+    """The runs of one task; adds remarks on files that cannot be read."""
     differing = _differing(runs)
     labels = _labels(runs, differing)
     shown = []
     distortions: list[Distortion | None] = []
     for run, label in zip(runs, labels, strict=True):
-        curves, remarks = read_curves(run.folder)
-        pictures, more = read_pictures(run.folder)
-        remarks += more
+        curves, of_curves = read_curves(run.folder)
+        pictures, of_pictures = read_pictures(run.folder)
+        reasons = [*of_curves, *of_pictures]
         shapes: list[Shape] = []
         distortion = None
         try:
-            shapes, distortion = read_shapes(task, run.folder)
+            shapes, distortion = read_shapes(task, run.folder, trust)
         except NsmError as error:
-            remarks.append(f"no 3D view and no histogram: {error}")
+            reasons.append(f"no 3D view and no histogram: {error}")
         distortions.append(distortion)
-        aside += [{"name": run.name, "reason": remark} for remark in remarks]
+        remarks += [{"name": run.name, "reason": reason} for reason in reasons]
         shown.append(
             {
                 "name": run.name,
                 "label": label,
-                "settings": {key: _word(value) for key, value in run.settings.items()},
+                "settings": {key: _shown(value) for key, value in run.settings.items()},
                 "figures": run.figures,
                 "curves": {tag: curve._asdict() for tag, curve in curves.items()},
                 "pictures": pictures,
@@ -98,76 +108,66 @@ def _task(
 
 
 def _differing(runs: Sequence[Run]) -> list[str]:
-    """Settings that are not the same in all runs."""
-    keys = list(dict.fromkeys(key for run in runs for key in run.settings))
-    missing = object()
+    """The settings that are not the same in all runs."""
+    keys = dict.fromkeys(key for run in runs for key in run.settings)
 
     def values(key: str) -> set[str]:
-        found = [run.settings.get(key, missing) for run in runs]
-        return {"" if value is missing else f"={_word(value)}" for value in found}
+        return {f"={_shown(run.settings[key])}" if key in run.settings else "" for run in runs}
 
     return [key for key in keys if len(values(key)) > 1]
 
 
 def _labels(runs: Sequence[Run], differing: Sequence[str]) -> list[str]:
-    """A short name for each run: the settings that differ, or its path where they do not tell."""
-    chosen = {key.removesuffix(".name") for key in differing if key.endswith(".name")}
+    """A short label for each run: settings that differ, or its path if those are not unique."""
     last = Counter(key.rsplit(".", 1)[-1] for key in differing)
-
-    def called(key: str) -> str:
-        plain = key.removesuffix(".name")
-        end = plain.rsplit(".", 1)[-1]
-        return end if last[end] == 1 else plain
-
     labels = []
     for run in runs:
-        # the choice of a group says enough of the parameters that come with it
-        own = [
+        # the choice of a group stands for its parameters
+        chosen = [
             key
             for key in differing
             if isinstance(run.settings.get(key), (str, int, float))
-            and (key.endswith(".name") or key.rsplit(".", 1)[0] not in chosen)
+            and key.rpartition(".")[0] not in differing
         ]
-        words = [f"{called(key)}={_brief(run.settings[key])}" for key in own[:_LABEL_SETTINGS]]
-        labels.append(", ".join(words))
+        short = {key: key.rsplit(".", 1)[-1] for key in chosen[:_LABEL_SETTINGS]}
+        parts = [
+            f"{end if last[end] == 1 else key}={_brief(run.settings[key])}"
+            for key, end in short.items()
+        ]
+        labels.append(", ".join(parts))
     if len(set(labels)) < len(labels) or not all(labels):
         return [run.name for run in runs]
     return labels
 
 
 def _brief(value: Any) -> str:
-    """A setting within a name: of a path the last part."""
-    return str(_word(value)).rsplit("/", 1)[-1][:40]
+    """A setting in a label: of a path the last part."""
+    return str(_shown(value)).rsplit("/", 1)[-1][:40]
 
 
-def _word(value: Any) -> str | float | None:
-    """A setting as it is shown: numbers as they are, all else as text."""
-    if value is None or (isinstance(value, (int, float)) and not isinstance(value, bool)):
-        finite = value is None or abs(value) < float("inf")
-        return value if finite else str(value)
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+def _shown(value: Any) -> str | float | None:
+    """A setting on the page: finite numbers unchanged, everything else as text."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return value if abs(value) < float("inf") else str(value)
+    if value is None or isinstance(value, str):
+        return value
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _described(keys: set[str]) -> list[dict[str, Any]]:
-    """The figures in the order of their tables; those without a label last, as secondary."""
+    """The figures in the order of the tables; those without a label come last and are hidden."""
     order = {key: n for n, key in enumerate(FIGURES)}
     result = []
     for key in sorted(keys, key=lambda k: (order.get(k, len(order)), k)):
         label, unit = FIGURES.get(key, (key.replace("_", " "), ""))
-        best = "low"
-        if key in _HIGHER_IS_BETTER:
-            best = "high"
-        elif key in _ZERO_IS_BEST:
-            best = "zero"
-        elif key in _NEITHER or key not in FIGURES:
-            best = "none"
         main = key in FIGURES
+        best = _BEST.get(key, "low" if main else "none")
         result.append({"key": key, "label": label, "unit": unit, "best": best, "main": main})
     return result
 
 
 def _histograms(distortions: Sequence[Distortion | None]) -> list[dict[str, Any]]:
-    """For each energy edges shared by all runs, and each run's share of area between them."""
+    """For each energy the edges of bins, the same for all runs, and each run's share of area."""
     known = [distortion for distortion in distortions if distortion is not None]
     result: list[dict[str, Any]] = []
     for energy in _HISTOGRAMS:
@@ -183,7 +183,7 @@ def _histograms(distortions: Sequence[Distortion | None]) -> list[dict[str, Any]
 
 
 def _shares(distortion: Distortion, energy: str, edges: np.ndarray) -> list[float]:
-    """Percent of the source's area in each bin; what lies beyond counts in the outermost ones."""
+    """Percent of the source's area in each bin; values beyond the ends count in the last bins."""
     values = np.nan_to_num(distortion.values[energy], nan=np.inf)
     inside = np.clip(values, edges[0], edges[-1])
     counts = np.histogram(inside, bins=edges, weights=distortion.areas)[0]
@@ -198,7 +198,7 @@ def _packed(shape: Shape, arrays: _Arrays) -> dict[str, Any]:
     colours = {}
     for name, values in shape.colours.items():
         finite = np.where(np.isfinite(values), values, np.nan)
-        known = finite[np.isfinite(finite)]
+        known = values[np.isfinite(values)]
         colours[name] = {
             "values": arrays.add(finite),
             "of": "faces" if len(values) == len(shape.faces) else "vertices",

@@ -1,21 +1,24 @@
-"""Learning curves of a run, from its TensorBoard event files and CSV logs."""
+"""The learning curves of a run, from its TensorBoard event files and CSV logs."""
 
 from __future__ import annotations
 
 import csv
 import logging
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
-_POINTS = 500  # of a curve; more would only make the page larger
+from nsm.results.report.runs import short
+
+_POINTS = 500  # at most, per curve: more would only enlarge the page
 _NO_CURVES = ("hp_metric", "epoch")
 
 
 class Curve(NamedTuple):
-    """A scalar over the training: steps, values, and seconds since the first value, if known."""
+    """A scalar during training: steps, values and, if known, seconds since the first value."""
 
     steps: list[int]
     values: list[float | None]
@@ -23,7 +26,7 @@ class Curve(NamedTuple):
 
 
 def read_curves(folder: Path) -> tuple[dict[str, Curve], list[str]]:
-    """The curves of a run folder by their tags, and remarks on files that are damaged."""
+    """The curves of a run folder by their tags, and remarks on damaged files."""
     curves: dict[str, Curve] = {}
     remarks = []
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
@@ -31,12 +34,12 @@ def read_curves(folder: Path) -> tuple[dict[str, Curve], list[str]]:
         try:
             curves.update(_from_csv(file))
         except (OSError, ValueError, csv.Error) as error:
-            remarks.append(f"{file.relative_to(folder)}: {' '.join(str(error).split())[:120]}")
+            remarks.append(f"{file.relative_to(folder)}: {short(error)}")
     for place in sorted({file.parent for file in folder.rglob("events.out.tfevents.*")}):
         try:
             curves.update(_from_events(place))
-        except Exception as error:  # the reader has no exception of its own for damaged files
-            remarks.append(f"{place.relative_to(folder)}: {' '.join(str(error).split())[:120]}")
+        except Exception as error:  # the reader has no exception class for damaged files
+            remarks.append(f"{place.relative_to(folder)}: {short(error)}")
     return {tag: curves[tag] for tag in sorted(curves)}, remarks
 
 
@@ -47,15 +50,10 @@ def _from_events(place: Path) -> dict[str, Curve]:
     for tag in reader.Tags()[SCALARS]:
         if tag in _NO_CURVES:
             continue
-        # a resumed run repeats the steps after its last checkpoint: the later value counts
+        # a resumed run repeats the steps after its last checkpoint: keep the later value
         events = {event.step: event for event in reader.Scalars(tag)}
-        kept = _thinned(sorted(events))
-        start = events[kept[0]].wall_time
-        curves[tag] = Curve(
-            kept,
-            [_finite(events[step].value) for step in kept],
-            [round(events[step].wall_time - start, 3) for step in kept],
-        )
+        times = {step: event.wall_time for step, event in events.items()}
+        curves[tag] = _curve({step: event.value for step, event in events.items()}, times)
     return curves
 
 
@@ -67,17 +65,17 @@ def _from_csv(file: Path) -> dict[str, Curve]:
         for tag, text in row.items():
             if tag not in ("step", *_NO_CURVES) and tag and text:
                 values.setdefault(tag, {})[int(row["step"])] = float(text)
-    curves = {}
-    for tag, by_step in values.items():
-        kept = _thinned(sorted(by_step))
-        curves[tag] = Curve(kept, [_finite(by_step[step]) for step in kept], None)
-    return curves
+    return {tag: _curve(by_step) for tag, by_step in values.items()}
 
 
-def _thinned(steps: list[int]) -> list[int]:
-    stride = -(-len(steps) // _POINTS)
-    kept = steps[::stride]
-    return kept if kept[-1] == steps[-1] else [*kept, steps[-1]]
+def _curve(values: Mapping[int, float], times: Mapping[int, float] | None = None) -> Curve:
+    """The curve of values and times by step, thinned but with its last step."""
+    steps = sorted(values)
+    kept = steps[:: -(-len(steps) // _POINTS)]
+    if kept[-1] != steps[-1]:
+        kept.append(steps[-1])
+    seconds = [round(times[step] - times[kept[0]], 3) for step in kept] if times else None
+    return Curve(kept, [_finite(values[step]) for step in kept], seconds)
 
 
 def _finite(value: float) -> float | None:

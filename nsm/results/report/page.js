@@ -5,27 +5,27 @@
     "#a0714f", "#e377c2", "#7f8896", "#b0b32e", "#22a9c0",
   ];
   const DASHES = ["solid", "dash", "dot", "dashdot"];
-  const VIEWS = 6; // browsers allow a page few 3D contexts at a time
+  const VIEWS = 6; // browsers limit the 3D contexts of a page
   const MISSING = "—";
 
   const $ = (selector) => document.querySelector(selector);
-  // everything that comes from files enters the page here, as text
+  // all content of files enters the page here, as text
   const make = (tag, properties = {}, ...children) => {
     const element = Object.assign(document.createElement(tag), properties);
     element.append(...children);
     return element;
   };
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  const unpacked = (id) => {
+  const decompressed = (id) => {
     const packed = new Blob([bytes($("#" + id).textContent)]);
     return new Response(packed.stream().pipeThrough(new DecompressionStream("gzip"))).text();
   };
   const short = (text, length) =>
     String(text).length > length ? String(text).slice(0, length - 1) + "…" : String(text);
-  // plotly reads a little markup in its labels
+  // plotly interprets some markup in labels
   const label = (text) => short(text, 44).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
 
-  const { title, tasks, incomplete, arrays } = JSON.parse(await unpacked("content"));
+  const { title, tasks, incomplete, arrays } = JSON.parse(await decompressed("content"));
   const array = (index) => {
     const stored = arrays[index];
     if (!stored.values) {
@@ -37,8 +37,8 @@
 
   let task = tasks[0];
   for (const one of tasks) {
-    one.off = new Set(); // runs without a tick
-    one.open = new Set(); // runs whose settings are shown
+    one.off = new Set(); // hidden runs
+    one.open = new Set(); // runs with expanded settings
     one.filters = new Map();
     one.search = "";
     one.sort = null;
@@ -51,18 +51,18 @@
 
   // ---- controls
   const control = (section, ...elements) => $(section + " .controls").replaceChildren(...elements);
-  const select = (words, options, key, changed) => {
+  const select = (caption, options, key, changed) => {
     if (!options.includes(choices[key])) choices[key] = options[0];
     const box = make("select");
     for (const option of options) box.append(make("option", { value: option, textContent: option }));
     box.value = choices[key] ?? "";
     box.onchange = () => { choices[key] = box.value; changed(); };
-    return make("label", {}, words, box);
+    return make("label", {}, caption, box);
   };
-  const tick = (words, key, changed) => {
+  const tick = (caption, key, changed) => {
     const box = make("input", { type: "checkbox", checked: choices[key] });
     box.onchange = () => { choices[key] = box.checked; changed(); };
-    return make("label", {}, box, words);
+    return make("label", {}, box, caption);
   };
 
   // ---- table
@@ -79,23 +79,23 @@
     return value !== 0 && Math.abs(value) < 1e-4 ? value.toExponential(2) : String(Number(value.toPrecision(4)));
   };
   const passes = (value, filter) => {
-    const words = /^\s*(<=|>=|<|>|=)\s*(-?\d*\.?\d+(?:e[-+]?\d+)?)\s*$/i.exec(filter);
-    if (!words) return String(shown(value)).toLowerCase().includes(filter.trim().toLowerCase());
+    const match = /^\s*(<=|>=|<|>|=)\s*(-?\d*\.?\d+(?:e[-+]?\d+)?)\s*$/i.exec(filter);
+    if (!match) return String(shown(value)).toLowerCase().includes(filter.trim().toLowerCase());
     if (typeof value !== "number") return false;
-    const bound = Number(words[2]);
-    return { "<": value < bound, ">": value > bound, "<=": value <= bound, ">=": value >= bound, "=": value === bound }[words[1]];
+    const bound = Number(match[2]);
+    return { "<": value < bound, ">": value > bound, "<=": value <= bound, ">=": value >= bound, "=": value === bound }[match[1]];
   };
   const compare = (a, b) => {
     if (a === null || b === null) return (a === null) - (b === null);
     if (typeof a === "number" && typeof b === "number") return a - b;
     return String(a).localeCompare(String(b), undefined, { numeric: true });
   };
-  // runs that pass the filters, in the order of the table
+  // the runs that pass the filters, in the order of the table
   const listed = () => {
     const all = columns();
     const kept = task.runs.filter((run) =>
       all.every((column) => !task.filters.get(column.key) || passes(column.of(run), task.filters.get(column.key))) &&
-      [run.name, run.label, ...Object.values(run.settings).map(shown)].some((word) => String(word).toLowerCase().includes(task.search)));
+      [run.name, run.label, ...Object.values(run.settings).map(shown)].some((text) => String(text).toLowerCase().includes(task.search)));
     const by = task.sort && all.find((column) => column.key === task.sort.key);
     if (!by) return kept;
     const missing = (run) => by.of(run) === null;
@@ -169,7 +169,7 @@
       rows.push(row);
       if (task.open.has(run)) rows.push(details(run, all.length));
     }
-    if (!runs.length) rows.push(make("tr", {}, make("td", { colSpan: all.length, textContent: "no run passes the filters" })));
+    if (!runs.length) rows.push(make("tr", {}, make("td", { colSpan: all.length, textContent: "no run matches the filters" })));
     $("#table tbody").replaceChildren(...rows);
   };
   const details = (run, width) => {
@@ -209,7 +209,7 @@
     const timed = task.runs.some((run) => Object.values(run.curves).some((curve) => curve.seconds));
     if (!tags.includes(choices.tag)) choices.tag = first;
     control("#curves", select("curve", tags, "tag", drawCurves),
-      select("over", timed ? ["steps", "seconds"] : ["steps"], "axis", drawCurves), tick("logarithmic", "log", drawCurves));
+      select("x axis", timed ? ["steps", "seconds"] : ["steps"], "axis", drawCurves), tick("logarithmic", "log", drawCurves));
     const traces = visible()
       .filter((run) => run.curves[choices.tag]?.[choices.axis])
       .map((run) => ({
@@ -258,7 +258,7 @@
 
   // ---- shapes
   let page = 0;
-  const panes = []; // reused, for a browser gives a page few 3D contexts
+  const panes = []; // reused, because browsers limit the 3D contexts of a page
   const pane = (n) => {
     while (panes.length <= n) {
       const caption = make("figcaption"), view = make("div", { className: "view" });
@@ -266,14 +266,14 @@
     }
     return panes[n];
   };
-  let turning = false;
-  const together = (source, change) => {
+  let synchronizing = false;
+  const synchronize = (source, change) => {
     const camera = change["scene.camera"];
-    if (!camera || turning) return;
-    turning = true;
+    if (!camera || synchronizing) return;
+    synchronizing = true;
     const others = panes.filter((other) => other.view !== source && other.figure.isConnected);
     Promise.all(others.map((other) => Plotly.relayout(other.view, { "scene.camera": camera })))
-      .finally(() => { turning = false; });
+      .finally(() => { synchronizing = false; });
   };
   const drawShapes = async () => {
     const having = task.runs.filter((run) => run.shapes.length);
@@ -288,7 +288,7 @@
     const by = select("colour", [...keys, "none"], "colour", drawShapes);
     const pages = Math.max(1, Math.ceil(shapes.length / VIEWS));
     page = Math.min(page, pages - 1);
-    const step = (words, to) => make("button", { type: "button", textContent: words, disabled: to < 0 || to >= pages, onclick: () => { page = to; drawShapes(); } });
+    const step = (symbol, to) => make("button", { type: "button", textContent: symbol, disabled: to < 0 || to >= pages, onclick: () => { page = to; drawShapes(); } });
     control("#shapes", chosen, by, ...(pages > 1 ? [step("‹", page - 1), `${page + 1} / ${pages}`, step("›", page + 1)] : []));
 
     const ranges = shapes.map(([, shape]) => shape.colours[choices.colour]?.range).filter(Boolean);
@@ -337,12 +337,12 @@
         }, CONFIG);
       if (!panes[n].bound) {
         panes[n].bound = true;
-        view.on("plotly_relayout", (change) => together(view, change));
+        view.on("plotly_relayout", (change) => synchronize(view, change));
       }
     }
   };
 
-  // ---- the whole
+  // ---- page
   const update = () => {
     body();
     if (!window.Plotly) return;
@@ -365,7 +365,7 @@
 
   $("h1").textContent = title;
   const count = tasks.reduce((sum, one) => sum + one.runs.length, 0);
-  $("#count").textContent = `${count} run${count === 1 ? "" : "s"}` + (incomplete.length ? `, ${incomplete.length} remark${incomplete.length === 1 ? "" : "s"} on what is incomplete or damaged` : "");
+  $("#count").textContent = `${count} run${count === 1 ? "" : "s"}` + (incomplete.length ? `, ${incomplete.length} problem${incomplete.length === 1 ? "" : "s"} (see the end of the page)` : "");
   $("#incomplete").hidden = !incomplete.length;
   for (const item of incomplete) {
     $("#incomplete ul").append(make("li", {}, item.name + " ", make("span", { textContent: item.reason })));
@@ -384,7 +384,7 @@
     return;
   }
   choose(task);
-  document.head.append(make("script", { textContent: await unpacked("library") }));
+  document.head.append(make("script", { textContent: await decompressed("library") }));
   update();
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
   document.documentElement.dataset.state = "ready";
@@ -392,5 +392,5 @@
   document.documentElement.dataset.state = "failed";
   const trouble = document.querySelector("#trouble");
   trouble.hidden = false;
-  trouble.textContent = "This page needs a browser of 2023 or newer: " + error;
+  trouble.textContent = "This page needs a browser from 2023 or later: " + error;
 });

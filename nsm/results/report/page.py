@@ -1,4 +1,4 @@
-"""The report as HTML: template, style, script, viewer library and content in one file."""
+"""The report as one HTML file: template, style, script, plotly and the content."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from plotly.offline import get_plotlyjs
 
 
 def page(title: str, content: dict[str, Any]) -> str:
-    """The page on a report's content.
+    """The page for a report's content.
 
-    No word of the content becomes HTML: it is packed, and the script puts it in as text. The
+    Nothing in the content becomes HTML: it is compressed, and the script inserts it as text. The
     page's content security policy forbids the browser to load anything.
     """
-    place = resources.files("nsm.results.report")
+    templates = resources.files("nsm.results.report")
     parts = {
         "title": html.escape(title),
-        "style": (place / "page.css").read_text(encoding="utf-8"),
-        "script": (place / "page.js").read_text(encoding="utf-8"),
-        "library": _packed(get_plotlyjs()),
-        "content": _packed(json.dumps(content, allow_nan=False, separators=(",", ":"))),
+        "style": (templates / "page.css").read_text(encoding="utf-8"),
+        "script": (templates / "page.js").read_text(encoding="utf-8"),
+        "library": _compressed(get_plotlyjs()),
+        "content": _compressed(json.dumps(content, allow_nan=False, separators=(",", ":"))),
     }
-    text = (place / "page.html").read_text(encoding="utf-8")
+    text = (templates / "page.html").read_text(encoding="utf-8")
     for name, part in parts.items():
         text = text.replace(f"<!--{name}-->", part, 1)
     return text
 
 
-def _packed(text: str) -> str:
+def _compressed(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()

@@ -1,4 +1,4 @@
-"""The pictures of a run, small enough for a page of many."""
+"""The pictures of a run, reduced in size for a page with many runs."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 
 from PIL import Image
 
+from nsm.results.report.runs import short
+
 _WIDTH = 1000
 
 
 def read_pictures(folder: Path) -> tuple[dict[str, str], list[str]]:
-    """Name to data URI of each picture in a run folder, and remarks on those that are damaged."""
+    """The data URIs of the pictures of a run folder by name, and remarks on damaged files."""
     pictures: dict[str, str] = {}
     remarks = []
     for file in sorted(folder.glob("*.png")):
@@ -24,7 +26,7 @@ def read_pictures(folder: Path) -> tuple[dict[str, str], list[str]]:
                 data = io.BytesIO()
                 image.convert("RGB").save(data, format="WEBP", quality=82)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            remarks.append(f"{file.name}: {' '.join(str(error).split())[:120]}")
+            remarks.append(f"{file.name}: {short(error)}")
             continue
         pictures[file.stem] = f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode()}"
     return pictures, remarks

@@ -1,4 +1,4 @@
-"""Runs found in folders: their settings and figures, flat."""
+"""The runs in folders, with flat settings and figures."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from nsm.errors import NsmError
 
 Figure = float | str | None
 
-# settings that change nothing in a result
-_INCIDENTAL = ("resume", "logger", "artefacts", "trainer.progress")
+# settings that do not affect a result
+_INCIDENTAL = ("resume", "logger", "artefacts", "trust", "trainer.progress")
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Run:
     """A complete run.
 
     Attributes:
-        folder: where it lies.
-        name: its path below the folder in which it was found.
+        folder: of the run.
+        name: its path below the folder that was searched.
         task: overfit, param, ...
-        settings: "group.key" to value.
-        figures: name to number, yes or no; None for a number that is not finite.
+        settings: values by "group.key"; the class or name that a group chooses by "group".
+        figures: numbers, yes or no by name; None for a number that is not finite.
     """
 
     folder: Path
@@ -40,24 +40,25 @@ class Run:
 
 @dataclass(frozen=True)
 class Incomplete:
-    """A run, or a part of one, that cannot be shown, and why."""
+    """A run, or a file of one, that cannot be shown, and the reason."""
 
     name: str
     reason: str
 
 
 def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
-    """All runs in the folders, however deep, in the order of their names.
+    """All runs in the folders and their subfolders, sorted by name.
 
     Raises:
-        NsmError: a folder that is not there; no run at all.
+        NsmError: ``missing_folder`` or ``no_runs``, with the folder as the key.
     """
     runs: list[Run] = []
     incomplete: list[Incomplete] = []
     seen: set[Path] = set()
     for folder in folders:
         if not folder.is_dir():
-            raise NsmError(f"{folder}: no such folder; give folders of runs or sweeps")
+            reason = f"{folder}: no such folder; give folders of runs or sweeps"
+            raise NsmError(reason, kind="missing_folder", key=str(folder))
         for place in run_folders(folder):
             if place.resolve() in seen:
                 continue
@@ -74,23 +75,24 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
             except NsmError as error:
                 incomplete.append(Incomplete(name, str(error)))
     if not runs and not incomplete:
-        words = ", ".join(str(folder) for folder in folders)
-        raise NsmError(f"{words}: no run there; a run's folder has a metrics.json")
+        listing = ", ".join(str(folder) for folder in folders)
+        reason = f"{listing}: no runs found; the folder of a run has a metrics.json"
+        raise NsmError(reason, kind="no_runs", key=listing)
     return runs, incomplete
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
-    """The folders of runs, complete or not, in a folder, however deep."""
+    """The folders of runs, complete or not, in a folder and its subfolders."""
     for path, inner, files in os.walk(folder):
         inner.sort(key=lambda name: (len(name), name) if name.isdigit() else (0, name))
         if not {"metrics.json", "config.yaml", "error.txt"}.isdisjoint(files):
             yield Path(path)
         if "metrics.json" in files:
-            inner.clear()  # what lies in a run's folder belongs to it
+            inner.clear()  # subfolders of a run belong to it
 
 
 def _unfinished(folder: Path) -> str:
-    """Why there are no figures: what a sweep wrote down of a job that failed, if it did."""
+    """Why a run has no figures: the error that a sweep recorded for a failed job, if any."""
     try:
         lines = (folder / "error.txt").read_text(encoding="utf-8").strip().splitlines()
     except (OSError, ValueError):
@@ -100,65 +102,74 @@ def _unfinished(folder: Path) -> str:
 
 def _read(folder: Path, name: str) -> Run:
     try:
-        words = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        figures = _figures(words)
+        figures = _figures(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError, TypeError) as error:
-        raise NsmError(f"metrics.json is damaged: {_short(error)}") from error
+        raise _damaged(f"metrics.json is damaged: {short(error)}", folder) from error
     try:
         config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         if not isinstance(config, dict):
-            raise ValueError("no settings in it")
+            raise ValueError("it has no settings")
         settings = dict(_flat(config))
-        task = settings.pop("task.name")
+        task = settings.pop("task")
     except FileNotFoundError as error:
-        raise NsmError("config.yaml is missing") from error
-    except Exception as error:  # whatever a damaged or foreign file raises
-        raise NsmError(f"config.yaml is damaged: {_short(error)}") from error
+        raise _damaged("config.yaml is missing", folder) from error
+    except Exception as error:  # a damaged or foreign file raises any exception
+        raise _damaged(f"config.yaml is damaged: {short(error)}", folder) from error
     return Run(folder, name, str(task), settings, figures)
 
 
-def _flat(words: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in words.items():
-        name = f"{prefix}{key}"
-        if name in _INCIDENTAL:
+def _damaged(reason: str, folder: Path) -> NsmError:
+    return NsmError(reason, kind="damaged_file", key=str(folder))
+
+
+def _flat(settings: Mapping[Any, Any], group: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings by "group.key"; the ``name`` or ``_target_`` of a group by "group"."""
+    for key, value in settings.items():
+        name = f"{group}.{key}" if group else str(key)
+        if name in _INCIDENTAL or (key == "_target_" and "name" in settings):
             continue
         if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{name}.")
+            yield from _flat(value, name)
+        elif group and key == "_target_":
+            ours = str(value).startswith(("nsm.", "torch."))
+            yield group, str(value).rsplit(".", 1)[-1] if ours else value
         else:
-            yield name, value
+            yield (group if group and key == "name" else name), value
 
 
-def _figures(words: Any) -> dict[str, Figure]:
-    """Figures of metrics.json by one name each.
+def _figures(content: Any) -> dict[str, Figure]:
+    """The figures of metrics.json, flat.
 
-    Of ``task=param`` those of nsm have plain names, those of a collection's pairs their mean.
+    Those of nsm among the maps of ``task=param`` keep their names; those of a collection are the
+    means over its pairs.
     """
-    if not isinstance(words, Mapping) or not isinstance(words.get("metrics"), Mapping):
-        raise ValueError("no figures in it")
-    figures = _numbers({key: words[key] for key in ("steps", "seconds") if key in words})
-    aside: dict[str, Figure] = {}
-    for key, value in words["metrics"].items():
+    if not isinstance(content, Mapping) or not isinstance(content.get("metrics"), Mapping):
+        raise ValueError("it has no figures")
+    figures = _numbers({key: content[key] for key in ("steps", "seconds") if key in content})
+    others: dict[str, Figure] = {}
+    for key, value in content["metrics"].items():
         if key == "nsm" and isinstance(value, Mapping):
             figures.update(_numbers(value))
         elif key == "pairs" and isinstance(value, Mapping):
             pairs = {name: _numbers(of_pair) for name, of_pair in value.items()}
             figures.update(_means(list(pairs.values())))
-            aside.update({f"{name}: {k}": v for name, own in pairs.items() for k, v in own.items()})
+            for name, of_pair in pairs.items():
+                others.update({f"{name}: {k}": v for k, v in of_pair.items()})
         elif isinstance(value, Mapping):
-            aside.update({f"{key}: {k}": v for k, v in _numbers(value).items()})
+            others.update({f"{key}: {k}": v for k, v in _numbers(value).items()})
         else:
             figures.update(_numbers({key: value}))
-    return {**figures, **aside}
+    return {**figures, **others}
 
 
-def _numbers(words: Mapping[str, Any]) -> dict[str, Figure]:
-    """What of words can stand in a table: numbers, and yes or no."""
+def _numbers(figures: Mapping[str, Any]) -> dict[str, Figure]:
+    """The figures that fit in a table: numbers, and yes or no."""
     result: dict[str, Figure] = {}
-    for key, value in words.items():
+    for key, value in figures.items():
         if isinstance(value, bool):
             result[key] = "yes" if value else "no"
         elif isinstance(value, (int, float)):
-            # JSON of other writers may hold NaN
+            # other writers of JSON allow NaN
             result[key] = value if abs(value) < float("inf") else None
         elif value is None:
             result[key] = None
@@ -166,7 +177,7 @@ def _numbers(words: Mapping[str, Any]) -> dict[str, Figure]:
 
 
 def _means(pairs: Sequence[Mapping[str, Figure]]) -> dict[str, Figure]:
-    """The mean of each figure that all pairs have; of yes and no, whether all say yes."""
+    """The mean of each figure that all pairs have; yes if all pairs have yes."""
     result: dict[str, Figure] = {}
     for key in pairs[0] if pairs else ():
         values = [pair.get(key) for pair in pairs]
@@ -178,5 +189,6 @@ def _means(pairs: Sequence[Mapping[str, Figure]]) -> dict[str, Figure]:
     return result
 
 
-def _short(error: Exception) -> str:
+def short(error: Exception) -> str:
+    """The message of an error in one line of at most 120 characters."""
     return " ".join(str(error).split())[:120] or type(error).__name__

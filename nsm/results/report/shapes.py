@@ -1,9 +1,9 @@
-"""What a run made, as shapes to turn and as distortion measured on its triangles."""
+"""The shapes of a run for the 3D views, and the distortion of its triangles."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,16 +16,17 @@ from nsm.results.metrics import vertex_error
 from nsm.results.pair_metrics import ENERGIES, triangle_energies
 from nsm.results.parameterization import load_parameterization
 from nsm.results.render import view_frame
+from nsm.results.report.runs import short
 from nsm.results.surface_map import SurfaceMap, load_surface_map
 from nsm.surfaces.geometry import decimate
 from nsm.surfaces.topology import face_areas
 
-_FACES = 50_000  # of a shape; finer meshes are coarsened for the page
+_FACES = 50_000  # at most, per shape; finer meshes are decimated for the page
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh to look at: (V, 3), (F, 3), with values (V,) or (F,) by which it is coloured."""
+    """A mesh (V, 3), (F, 3) to display, with values (V,) or (F,) to colour it by."""
 
     name: str
     vertices: np.ndarray
@@ -36,30 +37,42 @@ class Shape:
 
 @dataclass(frozen=True)
 class Distortion:
-    """Energies (F,) of triangles by name, and these triangles' areas (F,) on the source."""
+    """The energies (F,) of triangles by name, and their areas (F,) on the source."""
 
     values: dict[str, np.ndarray]
     areas: np.ndarray
 
 
-def read_shapes(task: str, folder: Path) -> tuple[list[Shape], Distortion]:
-    """The shapes of a run, and the distortion of its map over the triangles of the mesh.
+_Read = tuple[list[Shape], Distortion]
 
-    For ``overfit`` the map is the mesh to φ; for a collection all pairs count together.
+
+def read_shapes(
+    task: str, folder: Path, trust: Sequence[str] = ()
+) -> tuple[list[Shape], Distortion]:
+    """The shapes of a run, and the distortion of its map on the triangles of the mesh.
+
+    The map of ``overfit`` is from the mesh to φ; the distortion of a collection is that of all
+    pairs together.
+
+    Args:
+        task: of the run.
+        folder: of the run.
+        trust: modules outside nsm whose code the files may name.
 
     Raises:
-        NsmError: artefacts that are missing, damaged, or of a task that makes none.
+        NsmError: ``no_shapes``, ``damaged_file``, or as the loaders.
     """
     if task not in _READERS:
-        raise NsmError(f"task {task} has no shapes")
+        raise NsmError(f"task {task} has no shapes", kind="no_shapes", key=task)
     try:
-        return _READERS[task](folder)
+        return _READERS[task](folder, trust)
     except (ValueError, IndexError, RuntimeError) as error:  # arrays that do not fit together
-        raise NsmError(f"not readable: {' '.join(str(error).split())[:120]}") from error
+        reason = f"not readable: {short(error)}"
+        raise NsmError(reason, kind="damaged_file", key=str(folder)) from error
 
 
-def _overfit(folder: Path) -> tuple[list[Shape], Distortion]:
-    neural = load_surface(folder)
+def _overfit(folder: Path, trust: Sequence[str]) -> _Read:
+    neural = load_surface(folder, trust=trust)
     surface = neural.surface
     vertices, faces, _ = neural.to_mesh()
     distortion = _measured(surface.vertices, vertices, faces)
@@ -76,8 +89,8 @@ def _overfit(folder: Path) -> tuple[list[Shape], Distortion]:
     return shapes, distortion
 
 
-def _param(folder: Path) -> tuple[list[Shape], Distortion]:
-    result = load_parameterization(folder)
+def _param(folder: Path, trust: Sequence[str]) -> _Read:
+    result = load_parameterization(folder, trust=trust)
     surface, uv = result.phi.surface, result.uv
     flat = np.column_stack([uv, np.zeros(len(uv))])
     distortion = _measured(surface.vertices, flat, surface.faces)
@@ -88,14 +101,14 @@ def _param(folder: Path) -> tuple[list[Shape], Distortion]:
     return shapes, distortion
 
 
-def _pair_map(folder: Path) -> tuple[list[Shape], Distortion]:
-    f = load_surface_map(folder)
+def _pair_map(folder: Path, trust: Sequence[str]) -> _Read:
+    f = load_surface_map(folder, trust=trust)
     image, source, distortion = _both_ends(f)
     return [image("mapped onto the target"), source("source")], distortion
 
 
-def _collection_map(folder: Path) -> tuple[list[Shape], Distortion]:
-    collection = load_collection(folder)
+def _collection_map(folder: Path, trust: Sequence[str]) -> _Read:
+    collection = load_collection(folder, trust=trust)
     shapes, parts = [], []
     for i, j in itertools.permutations(range(len(collection)), 2):
         f = collection.pair(i, j)
@@ -109,7 +122,7 @@ def _collection_map(folder: Path) -> tuple[list[Shape], Distortion]:
     return shapes, Distortion(values, np.concatenate([part.areas for part in parts]))
 
 
-_READERS: dict[str, Callable[[Path], tuple[list[Shape], Distortion]]] = {
+_READERS: dict[str, Callable[[Path, Sequence[str]], _Read]] = {
     "overfit": _overfit,
     "param": _param,
     "pair_map": _pair_map,
@@ -121,12 +134,12 @@ _NAMES = [energy.__name__.replace("_", " ") for energy in ENERGIES]
 def _both_ends(
     f: SurfaceMap,
 ) -> tuple[Callable[[str], Shape], Callable[[str], Shape], Distortion]:
-    """Makers of the mapped mesh and of the source, by name, and the map's distortion."""
+    """Functions from a name to the image and to the source, and the map's distortion."""
     surface = f.source.surface
     distortion = _measured(surface.vertices, f.image, surface.faces)
-    # one colour for a point and its image, so that the correspondence is seen
-    places = {f"{axis} on the source": surface.vertices[:, k] for k, axis in enumerate("xyz")}
-    colours = {**distortion.values, **places}
+    # a point and its image get the same colour, which shows the correspondence
+    positions = {f"{axis} on the source": surface.vertices[:, k] for k, axis in enumerate("xyz")}
+    colours = {**distortion.values, **positions}
     frame = view_frame(f.target.surface.vertices)
 
     def image(name: str) -> Shape:
@@ -144,7 +157,7 @@ def _measured(source: np.ndarray, image: np.ndarray, faces: np.ndarray) -> Disto
 
 
 def _face_angles(vertices: np.ndarray, reference: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Angles (F,) in degrees between the normals that two meshes have at the same faces."""
+    """Angles (F,) in degrees between the normals of the same faces of two meshes."""
     a, b = (
         np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]])
         for p in (vertices, reference)
@@ -164,9 +177,9 @@ def _shape(
         frame = view_frame(vertices)
     if len(faces) <= _FACES:
         return Shape(name, vertices, faces, colours, frame)
-    kept, coarse, birth = decimate(vertices, faces, _FACES)
-    taken = {
-        key: values[kept] if len(values) == len(vertices) else values[birth]
+    kept, coarse, parent = decimate(vertices, faces, _FACES)
+    decimated = {
+        key: values[kept] if len(values) == len(vertices) else values[parent]
         for key, values in colours.items()
     }
-    return Shape(name, vertices[kept], coarse, taken, frame)
+    return Shape(name, vertices[kept], coarse, decimated, frame)

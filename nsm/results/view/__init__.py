@@ -1,4 +1,4 @@
-"""The viewer: a run's shapes in the browser, where a point picked on one is seen on the other."""
+"""The viewer: the shapes of a run in the browser, with points and their images marked on both."""
 
 from nsm.results.view.server import Viewer, serving
 

@@ -1,4 +1,4 @@
-"""Shapes as GLB, as the browser draws them."""
+"""Shapes as GLB, for the browser."""
 
 from __future__ import annotations
 
@@ -6,25 +6,26 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.visual.color import srgb_to_linear
 
 from nsm.results.textures import checkerboard
 from nsm.results.view.scene import Paint, Shape
 
 
 def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
-    """A shape with its vertices at (V, 3), smooth, seen from both sides, in its colours."""
+    """A shape with its vertices at (V, 3), painted, double-sided and with smooth normals."""
     colours = np.ones((len(vertices), 4))
-    look: dict[str, Any] = {}
+    texture: dict[str, Any] = {}
     coordinates = np.zeros((len(vertices), 2))
     if paint.colours is not None:
-        colours[:, :3] = _linear(paint.colours)
-    if paint.board is not None:
-        coordinates = 0.5 * (paint.board + 1)
-        look["baseColorTexture"] = checkerboard()
+        colours[:, :3] = srgb_to_linear(np.clip(paint.colours, 0, 1))  # as glTF expects
+    if paint.checkerboard is not None:
+        coordinates = 0.5 * (paint.checkerboard + 1)
+        texture["baseColorTexture"] = checkerboard()
     visual = trimesh.visual.TextureVisuals(
         uv=coordinates,
         material=trimesh.visual.material.PBRMaterial(
-            metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True, **look
+            metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True, **texture
         ),
     )
     visual.vertex_attributes["color"] = np.round(255 * colours).astype(np.uint8)
@@ -38,9 +39,3 @@ def as_glb(shape: Shape, vertices: np.ndarray, paint: Paint) -> bytes:
     data = trimesh.Scene(mesh).export(file_type="glb", include_normals=True)
     assert isinstance(data, bytes)
     return data
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to what glTF has at vertices: linear light."""
-    c = np.clip(colours, 0, 1)
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -1,4 +1,4 @@
-"""What the viewer shows of a run: two shapes side by side, and which points of them correspond."""
+"""What the viewer shows of a run: two shapes side by side and the map between them."""
 
 from __future__ import annotations
 
@@ -22,35 +22,32 @@ from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import edges_of
 
 POSITION, PLAIN = "position on the source", "plain"
-# rotations that bring an axis to y, which a view takes for up
-_Y = np.eye(3)
-UPS = {
-    "y": _Y,
-    "z": _Y[[1, 2, 0]],
-    "x": _Y[[2, 0, 1]],
-    "-y": np.diag([-1.0, -1.0, 1.0]),
-    "-z": np.diag([-1.0, -1.0, 1.0]) @ _Y[[1, 2, 0]],
-    "-x": np.diag([-1.0, -1.0, 1.0]) @ _Y[[2, 0, 1]],
+# rotations of each axis to y, the upward axis of a view
+UP_AXES = {
+    sign + axis: flip @ np.roll(np.eye(3), -k, axis=0)
+    for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
+    for k, axis in enumerate("yzx")
 }
-_GAP = 0.2  # between the shapes, of the wider one
-_FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; of others, percentiles
+_GAP = 0.2  # between the shapes, in widths of the wider one
+_FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; others use percentiles
 _LARGEST = 1e3
-_FIELD_OF_VIEW = np.radians(18)  # narrow: both shapes are seen from one side
-_ASPECT, _ASIDE = 1.5, 0.26  # of a browser's window; the panel is at its right
+_NO_VERTICES = np.zeros(0, dtype=np.int64)
+_FIELD_OF_VIEW = np.radians(18)  # narrow: both shapes are seen from the same direction
+_ASPECT, _ASIDE = 1.5, 0.26  # of a browser window, with the panel at its right
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh to look at and to pick on.
+    """A mesh to display and to pick points on.
 
     Attributes:
-        name: what stands above it.
-        vertices: (V, 3) as it is shown, around the origin.
+        name: its label.
+        vertices: (V, 3) displayed positions, around the origin.
         faces: (F, 3).
-        uv: (V, 2) coordinates in its own domain.
-        own: (V, 3) or (V, 2), the vertices as they are told: in the units of the mesh file, or the
-            new coordinates of a flattening.
-        seam_pairs: (T, 2) vertices that were one before the mesh was cut.
+        uv: (V, 2) coordinates in its domain.
+        coordinates: (V, 3) or (V, 2) the numbers displayed for a vertex: in the units of the mesh
+            file, or the new coordinates of a flattening.
+        seam_pairs: (T, 2) copies of the same vertex of the uncut mesh.
         landmarks: (L,) vertices.
     """
 
@@ -58,13 +55,13 @@ class Shape:
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray
-    own: np.ndarray
+    coordinates: np.ndarray
     seam_pairs: np.ndarray
-    landmarks: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    landmarks: np.ndarray = field(default_factory=lambda: _NO_VERTICES)
 
     @cached_property
     def _uncut(self) -> np.ndarray:
-        """Of each vertex (V,) the first of those that were one with it."""
+        """For each vertex (V,) the first copy of the same vertex of the uncut mesh."""
         first = np.arange(len(self.vertices))
         first[self.seam_pairs[:, 1]] = self.seam_pairs[:, 0]
         return first
@@ -73,39 +70,39 @@ class Shape:
     def seam(self) -> np.ndarray:
         """The edges (E, 2) along which the mesh was cut, each once."""
         edges = edges_of(self.faces)
-        rim = edges.pairs[edges.count == 1]
-        before = np.sort(self._uncut[rim], axis=1)
-        _, first, count = np.unique(before, axis=0, return_index=True, return_counts=True)
-        return rim[first[count > 1]]
+        boundary = edges.pairs[edges.count == 1]
+        uncut = np.sort(self._uncut[boundary], axis=1)
+        _, first, count = np.unique(uncut, axis=0, return_index=True, return_counts=True)
+        return boundary[first[count > 1]]
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
-        """Unit normals (V, 3) where its vertices are at (V, 3); the seam is smooth."""
+        """Unit normals (V, 3) with its vertices at (V, 3), smooth across the seam."""
         return vertex_normals(vertices, self.faces, self.seam_pairs)
 
 
 class Scale(NamedTuple):
-    """Of colours that stand for numbers: the ends, and whether it is logarithmic."""
+    """A colour scale: its ends, and whether it is logarithmic."""
 
     low: float
     high: float
     log: bool
 
     def colours(self, values: np.ndarray) -> np.ndarray:
-        """Colours (N, 3) in [0, 1] of numbers (N,)."""
+        """Colours (N, 3) in [0, 1] of values (N,)."""
         norm = (LogNorm if self.log else Normalize)(self.low, self.high)
         return ScalarMappable(norm, "viridis").to_rgba(values)[:, :3]
 
     def bar(self, count: int) -> np.ndarray:
-        """The colours (count, 3) from end to end."""
+        """The colours (count, 3) of the scale, from low to high."""
         ends = np.geomspace if self.log else np.linspace
         return self.colours(ends(self.low, self.high, count))
 
 
 class Paint(NamedTuple):
-    """Colours of a shape: at its vertices (V, 3) in [0, 1], or a checkerboard at (V, 2)."""
+    """Colours of the vertices (V, 3) in [0, 1], or their coordinates (V, 2) on a checkerboard."""
 
     colours: np.ndarray | None
-    board: np.ndarray | None
+    checkerboard: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +111,13 @@ class Scene:
 
     Attributes:
         source, target: the two shapes.
-        image_uv: (V, 2) where the source's vertices go, in the target's domain. The map is linear
+        image_uv: (V, 2) images of the source's vertices in the target's domain. The map is linear
             on each triangle of the source.
-        image: (V, 3) where they go on the target, as it is shown.
-        frame: rows right, up and towards the viewer (3, 3).
-        boards: name to coordinates (V, 2) of the source in [-1, 1]², for checkerboards.
-        energies: name to numbers (F,) on the source's triangles.
-        errors: name to numbers (V,) at its vertices.
+        image: (V, 3) their images on the displayed target.
+        frame: (3, 3) unit vectors to the right, up and towards the viewer, as rows.
+        checkerboards: for each name, coordinates (V, 2) of the source's vertices in [-1, 1]².
+        energies: for each name, values (F,) on the source's triangles.
+        errors: for each name, values (V,) at its vertices.
     """
 
     source: Shape
@@ -128,7 +125,7 @@ class Scene:
     image_uv: np.ndarray
     image: np.ndarray
     frame: np.ndarray
-    boards: dict[str, np.ndarray]
+    checkerboards: dict[str, np.ndarray]
     energies: dict[str, np.ndarray]
     errors: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -138,19 +135,19 @@ class Scene:
 
     @property
     def colourings(self) -> list[str]:
-        """The names that :meth:`paint` knows."""
-        return [*self.boards, *self.errors, *self.energies, POSITION, PLAIN]
+        """The names that :meth:`paint` accepts."""
+        return [*self.checkerboards, *self.errors, *self.energies, POSITION, PLAIN]
 
     @cached_property
-    def _back(self) -> Places:
+    def _preimages(self) -> Places:
         return locate(self.target.uv, self.image_uv, self.source.faces)
 
-    def carried(self, values: np.ndarray) -> np.ndarray:
-        """Values (V, ...) at the source's vertices, at those of the target (W, ...)."""
-        return self._back.take(values, self.source.faces)
+    def transferred(self, values: np.ndarray) -> np.ndarray:
+        """Values (V, ...) at the source's vertices, transferred to the target's (W, ...)."""
+        return self._preimages.take(values, self.source.faces)
 
-    def across(self, side: int, places: Places) -> Places:
-        """Places on one shape (0: the source) to those on the other that correspond to them."""
+    def corresponding(self, side: int, places: Places) -> Places:
+        """The points of the other shape that correspond to places on one (0: the source)."""
         if side == 0:
             uv = places.take(self.image_uv, self.source.faces)
             return locate(uv, self.target.uv, self.target.faces)
@@ -158,47 +155,47 @@ class Scene:
         return locate(uv, self.image_uv, self.source.faces)
 
     def morph(self, t: float) -> np.ndarray:
-        """The source's vertices (V, 3) on the straight way to their images."""
+        """The source's vertices (V, 3) moved straight towards their images, t from 0 to 1."""
         return (1 - t) * self.source.vertices + t * self.image
 
     def paint(self, name: str) -> tuple[Paint, Paint]:
-        """The colours of both shapes; a point and its image have the same."""
-        if name in self.boards:
-            board = self.boards[name]
-            return Paint(None, board), Paint(None, self.carried(board))
+        """The paint of both shapes; a point and its image have the same colour."""
+        if name in self.checkerboards:
+            checkerboard = self.checkerboards[name]
+            return Paint(None, checkerboard), Paint(None, self.transferred(checkerboard))
         vertices = self.source.vertices
         scale = self.scale(name)
         if scale is not None:
             values = self._at_vertices(name)
-            of_target = self.carried(values)
-            return Paint(scale.colours(values), None), Paint(scale.colours(of_target), None)
+            on_target = self.transferred(values)
+            return Paint(scale.colours(values), None), Paint(scale.colours(on_target), None)
         colours = np.tile(GREY, (len(vertices), 1))
         if name == POSITION:
             extent = np.maximum(np.ptp(vertices, axis=0), 1e-12)
             colours = (vertices - vertices.min(axis=0)) / extent
-        return Paint(colours, None), Paint(self.carried(colours), None)
+        return Paint(colours, None), Paint(self.transferred(colours), None)
 
     def scale(self, name: str) -> Scale | None:
-        """What the colours of numbers stand for; None of other colourings."""
+        """The colour scale of an energy or error; None for other colourings."""
         if name not in self.energies and name not in self.errors:
             return None
         if name in _FIXED:
             return Scale(*_FIXED[name], log=True)
         values = self.errors.get(name, self.energies.get(name, np.zeros(0)))
-        known = values[np.isfinite(values)]
-        low, high = np.percentile(known, [1, 98]) if len(known) else (0.0, 0.0)
+        finite = values[np.isfinite(values)]
+        low, high = np.percentile(finite, [1, 98]) if len(finite) else (0.0, 0.0)
         return Scale(float(low), float(max(high, low + 1e-9)), log=False)
 
     def _at_vertices(self, name: str) -> np.ndarray:
         if name in self.errors:
             return self.errors[name]
-        # one triangle without any area would outshine all around it
+        # a degenerate triangle would dominate the mean at its vertices
         bounded = np.minimum(np.nan_to_num(self.energies[name], nan=np.inf), _LARGEST)
         return vertex_means(bounded, self.source.faces, len(self.source.vertices))
 
     @cached_property
     def offsets(self) -> np.ndarray:
-        """(2, 3) where the shapes' origins are put, so that they stand side by side."""
+        """(2, 3) positions of the shapes' origins, side by side."""
         half = self._half[:, 0]
         gap = _GAP * half.max()
         right = self.frame[0]
@@ -206,12 +203,12 @@ class Scene:
 
     @cached_property
     def _half(self) -> np.ndarray:
-        """Half of each shape's width, height and depth in the view (2, 3)."""
+        """(2, 3) half of each shape's width, height and depth in the view."""
         return np.stack([np.abs(s.vertices @ self.frame.T).max(axis=0) for s in self.shapes])
 
     @property
     def camera(self) -> tuple[np.ndarray, np.ndarray]:
-        """From where, and to where (3,), a camera with :attr:`field_of_view` sees both shapes."""
+        """Position and target (3,) of a camera that sees both shapes (:attr:`field_of_view`)."""
         width = self._half[:, 0].sum() + _GAP * self._half[:, 0].max()
         height, depth = self._half[:, 1:].max(axis=0)
         tangent = np.tan(0.5 * self.field_of_view)
@@ -225,16 +222,18 @@ class Scene:
 def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y") -> Scene:
     """A mesh beside its neural surface or its flattening, or the two surfaces of a map.
 
-    The axis ``up`` (of :data:`UPS`) of the mesh file, of a map's source, is shown upright.
+    Args:
+        result: of a run.
+        up: the axis of the (source's) mesh file that points up, one of :data:`UP_AXES`.
     """
     mesh = result.source if isinstance(result, SurfaceMap) else result
     mesh = mesh.phi if isinstance(mesh, Parameterization) else mesh
-    turn = UPS[up]
+    turn = UP_AXES[up]
     frame = view_frame(mesh.surface.vertices @ turn.T) @ turn
     if isinstance(result, SurfaceMap):
         return _pair(result, frame)
     if isinstance(result, Parameterization):
-        return _flat(result, frame)
+        return _flattening(result, frame)
     return _overfit(result, frame)
 
 
@@ -245,23 +244,23 @@ def _overfit(neural: NeuralSurface, frame: np.ndarray) -> Scene:
     centre = _centre(s.vertices, frame)
     source = _file_shape(f"{s.name}: mesh", neural, s.vertices - centre, s.vertices)
     target = _file_shape(f"{s.name}: neural surface", neural, image - centre, image)
-    boards = {"checkerboard of the domain": s.uv}
+    checkerboards = {"checkerboard of the domain": s.uv}
     energies = _energies(s, image)
-    return Scene(source, target, s.uv, target.vertices, frame, boards, energies, errors)
+    return Scene(source, target, s.uv, target.vertices, frame, checkerboards, energies, errors)
 
 
-def _flat(result: Parameterization, frame: np.ndarray) -> Scene:
+def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
     s, uv = result.phi.surface, result.uv
     middle = 0.5 * (uv.min(axis=0) + uv.max(axis=0))
-    # turned to the viewer, whichever way the surface is looked at
+    # facing the viewer, whatever the frame
     flat = (uv - middle) @ frame[:2]
     source = _file_shape(s.name, result.phi, s.vertices - _centre(s.vertices, frame), s.vertices)
     target = Shape(f"{s.name}: flattened", flat, s.faces, s.uv, uv, s.seam_pairs)
-    boards = {
+    checkerboards = {
         "checkerboard of the plane": 2 * (uv - middle) / np.ptp(uv, axis=0).max(),
         "checkerboard of the domain": s.uv,
     }
-    return Scene(source, target, s.uv, flat, frame, boards, _energies(s, uv))
+    return Scene(source, target, s.uv, flat, frame, checkerboards, _energies(s, uv))
 
 
 def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
@@ -271,9 +270,9 @@ def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
     start = s.vertices - _centre(s.vertices, frame)
     source = _file_shape(s.name, f.source, start, s.vertices, f.landmarks[:, 0])
     target = _file_shape(t.name, f.target, turned - centre, t.vertices, f.landmarks[:, 1])
-    boards = {"checkerboard of the source": s.uv, "checkerboard of the target": f.image_uv}
+    checkerboards = {"checkerboard of the source": s.uv, "checkerboard of the target": f.image_uv}
     image = f.aligned_image - centre
-    return Scene(source, target, f.image_uv, image, frame, boards, _energies(s, f.image))
+    return Scene(source, target, f.image_uv, image, frame, checkerboards, _energies(s, f.image))
 
 
 def _file_shape(
@@ -281,13 +280,12 @@ def _file_shape(
     neural: NeuralSurface,
     shown: np.ndarray,
     vertices: np.ndarray,
-    landmarks: np.ndarray | None = None,
+    landmarks: np.ndarray = _NO_VERTICES,
 ) -> Shape:
+    """A surface of a mesh file, with landmarks (L,) as vertices of the uncut mesh."""
     s = neural.surface
-    ids = () if landmarks is None else landmarks
-    rows = [int(s.cut_vertex[vertex]) for vertex in ids]
-    own = neural.in_original_units(vertices)
-    return Shape(name, shown, s.faces, s.uv, own, s.seam_pairs, np.array(rows, dtype=np.int64))
+    coordinates = neural.in_original_units(vertices)
+    return Shape(name, shown, s.faces, s.uv, coordinates, s.seam_pairs, s.cut_vertex[landmarks])
 
 
 def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:
@@ -296,6 +294,6 @@ def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _centre(vertices: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """The middle (3,) of a shape as it is seen."""
+    """The centre (3,) of a shape's bounding box in the view."""
     seen = vertices @ frame.T
     return 0.5 * (seen.min(axis=0) + seen.max(axis=0)) @ frame

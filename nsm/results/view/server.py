@@ -1,4 +1,4 @@
-"""The viewer in the browser. What it shows is worked out in the modules beside this one."""
+"""The viewer's server and panel. The other modules of this package compute what it shows."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from nsm.results.parameterization import Parameterization
 from nsm.results.surface_map import SurfaceMap
 from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import Pick, pick
-from nsm.results.view.scene import UPS, scene_of
+from nsm.results.view.scene import UP_AXES, scene_of
 
 Result = NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection
 
 _NODES = "/source", "/target"
-# of the last picks, on both shapes; when all are taken, the oldest pick goes
+# of the latest picks, on both shapes; a new one replaces the oldest
 PICK_COLOURS = {
     "red": (214, 39, 40),
     "blue": (31, 119, 220),
@@ -37,43 +37,43 @@ PICK_COLOURS = {
     "orange": (255, 140, 0),
 }
 _SOURCE_SEAM, _TARGET_SEAM = (255, 120, 0), (0, 150, 200)
-# in normalised units, in which every surface has the area of Ω
+# in normalized units: every surface has the area of Ω
 _PICK_RADIUS, _LANDMARK_RADIUS, _SEAM_WIDTH, _LIFT = 0.03, 0.014, 0.01, 0.004
 _BAR = (12, 256)
 
 
 class Viewer:
-    """What a run made, in a browser, and what a click there does.
+    """The result of a run in the browser.
 
     Args:
-        result: what :func:`nsm.load` gave.
-        server: viser's server.
+        result: from :func:`nsm.load`.
+        server: a ``viser.ViserServer``.
     """
 
     def __init__(self, result: Result, server: Any) -> None:
         self.result, self.server = result, server
-        self.picks: dict[str, Pick] = {}  # by the name of their colour, the oldest first
+        self.picks: dict[str, Pick] = {}  # by the name of their colour, oldest first
         self.markers: dict[str, tuple[Any, Any]] = {}
-        self._marks: list[Any] = []
-        self._lock = threading.RLock()  # viser calls back in threads, many at a time
-        self._ends = [0, 1]
-        self.scene = scene_of(self._map())
+        self._overlays: list[Any] = []
+        self._lock = threading.RLock()  # viser runs callbacks in several threads
+        self._pair = [0, 1]
+        self.scene = scene_of(self._current())
         self._build_panel()
         self._show_scene()
         server.scene.on_click()(self.on_click)
 
-    def _map(self) -> NeuralSurface | Parameterization | SurfaceMap:
+    def _current(self) -> NeuralSurface | Parameterization | SurfaceMap:
         if isinstance(self.result, SurfaceCollection):
-            return self.result.pair(*self._ends)
+            return self.result.pair(*self._pair)
         return self.result
 
     @property
     def shown(self) -> tuple[np.ndarray, np.ndarray]:
-        """The vertices (V, 3) of both shapes as they are now, without the scene's offsets."""
-        return self.scene.morph(self.way.value), self.scene.target.vertices
+        """The current vertices (V, 3) of both shapes, without the scene's offsets."""
+        return self.scene.morph(self.morph.value), self.scene.target.vertices
 
     def on_click(self, event: Any) -> None:
-        """Mark the point under the mouse and the one that corresponds to it."""
+        """Mark the point under the mouse and the corresponding one."""
         with self._lock:
             ray = np.array(event.ray_origin), np.array(event.ray_direction)
             found = pick(self.scene, *ray, self.shown)
@@ -91,29 +91,29 @@ class Viewer:
         self.ends: list[Any] = []
         if isinstance(self.result, SurfaceCollection):
             names = [f"{k}: {phi.surface.name}" for k, phi in enumerate(self.result.surfaces)]
-            for side, word in enumerate(("source", "target")):
-                choice = gui.add_dropdown(word, names, initial_value=names[self._ends[side]])
-                choice.on_update(self._locked(partial(self._choose, side)))
+            for side, end in enumerate(("source", "target")):
+                choice = gui.add_dropdown(end, names, initial_value=names[self._pair[side]])
+                choice.on_update(self._locked(partial(self._choose_pair, side)))
                 self.ends.append(choice)
         names = self.scene.colourings
         self.colouring = gui.add_dropdown("colours", names, initial_value=names[0])
         self._bar = gui.add_image(np.zeros((*_BAR, 3), dtype=np.uint8), visible=False)
         self._bar_ends = gui.add_markdown("", visible=False)
-        self.up = gui.add_dropdown("up", list(UPS), initial_value="y")
-        self.way = gui.add_slider(
-            "morph", 0.0, 1.0, 0.02, 0.0, hint="the left shape on its way to its image"
+        self.up = gui.add_dropdown("up", list(UP_AXES), initial_value="y")
+        self.morph = gui.add_slider(
+            "morph", 0.0, 1.0, 0.02, 0.0, hint="moves the left shape to its image"
         )
         self.landmarks = gui.add_checkbox("landmarks", bool(len(self.scene.source.landmarks)))
         self.seams = gui.add_checkbox("seams", False)
-        gui.add_markdown("A click on a shape marks the point, and its image on the other.")
-        forget = gui.add_button("forget the points")
+        gui.add_markdown("Click a shape to mark a point and its image on the other shape.")
+        clear = gui.add_button("clear points")
         self._list = gui.add_markdown("")
         self.colouring.on_update(self._locked(self._show_shapes))
-        self.up.on_update(self._locked(self._renew))
-        self.way.on_update(self._locked(self._show_way))
-        self.landmarks.on_update(self._locked(self._show_marks))
-        self.seams.on_update(self._locked(self._show_marks))
-        forget.on_click(self._locked(self._forget))
+        self.up.on_update(self._locked(self._rebuild))
+        self.morph.on_update(self._locked(self._show_morph))
+        self.landmarks.on_update(self._locked(self._show_overlays))
+        self.seams.on_update(self._locked(self._show_overlays))
+        clear.on_click(self._locked(self._clear_picks))
 
     def _locked(self, act: Callable[[], None]) -> Callable[[Any], None]:
         def call(_: Any) -> None:
@@ -122,25 +122,25 @@ class Viewer:
 
         return call
 
-    def _choose(self, side: int) -> None:
-        """Another pair of the collection; where both ends would be one, they change places."""
+    def _choose_pair(self, side: int) -> None:
+        """Show another pair of the collection; choosing the same surface twice swaps the two."""
         chosen = [choice.options.index(choice.value) for choice in self.ends]
-        if chosen == self._ends:
+        if chosen == self._pair:
             return
         if chosen[0] == chosen[1]:
-            chosen[1 - side] = self._ends[side]
-        self._ends = chosen
+            chosen[1 - side] = self._pair[side]
+        self._pair = chosen
         for choice, k in zip(self.ends, chosen, strict=True):
             choice.value = choice.options[k]
         self.picks.clear()
-        self._renew()
+        self._rebuild()
 
-    def _forget(self) -> None:
+    def _clear_picks(self) -> None:
         self.picks.clear()
         self._show_picks()
 
-    def _renew(self) -> None:
-        self.scene = scene_of(self._map(), self.up.value)
+    def _rebuild(self) -> None:
+        self.scene = scene_of(self._current(), self.up.value)
         self._show_scene()
 
     def _show_scene(self) -> None:
@@ -158,11 +158,11 @@ class Viewer:
                 f"{node}/name", shape.name, position=place, anchor="bottom-center"
             )
         self._show_shapes()
-        self._show_marks()
+        self._show_overlays()
         self._show_picks()
 
     def _show_shapes(self) -> None:
-        self._drawn = self.way.value
+        self._drawn = self.morph.value
         name = self.colouring.value
         for node, shape, vertices, paint, offset in zip(
             _NODES,
@@ -182,24 +182,24 @@ class Viewer:
             kind = ", logarithmic" if scale.log else ""
             self._bar_ends.content = f"{scale.low:.4g} to {scale.high:.4g}{kind}"
 
-    def _show_way(self) -> None:
-        if self.way.value == self._drawn:  # overtaken by a later move of the slider
+    def _show_morph(self) -> None:
+        if self.morph.value == self._drawn:  # already drawn
             return
         self._show_shapes()
-        self._show_marks()
+        self._show_overlays()
         self._show_picks()
 
-    def _show_marks(self) -> None:
-        for mark in self._marks:
+    def _show_overlays(self) -> None:
+        for mark in self._overlays:
             mark.remove()
-        self._marks.clear()
+        self._overlays.clear()
         for side in (0, 1):
             if self.landmarks.value:
-                self._add_landmarks(side)
+                self._show_landmarks(side)
             if self.seams.value:
-                self._add_seams(side)
+                self._show_seams(side)
 
-    def _add_landmarks(self, side: int) -> None:
+    def _show_landmarks(self, side: int) -> None:
         shape = self.scene.shapes[side]
         count = len(shape.landmarks)
         if count == 0:
@@ -214,10 +214,10 @@ class Viewer:
             batched_positions=self.shown[side][shape.landmarks] + self.scene.offsets[side],
             batched_colors=np.round(255 * hsv_to_rgb(hue)).astype(np.uint8),
         )
-        self._marks.append(mark)
+        self._overlays.append(mark)
 
-    def _add_seams(self, side: int) -> None:
-        """A shape's own seam; on the target also the image of the source's."""
+    def _show_seams(self, side: int) -> None:
+        """Draw a shape's seam, and on the target also the image of the source's."""
         source, target = self.scene.shapes
         shown = self.shown[side]
         lifted = shown + _LIFT * self.scene.shapes[side].normals(shown)
@@ -237,7 +237,7 @@ class Viewer:
                     colour,
                     thickness=_SEAM_WIDTH,
                 )
-                self._marks.append(mark)
+                self._overlays.append(mark)
 
     def _show_picks(self) -> None:
         for pair in self.markers.values():
@@ -248,7 +248,7 @@ class Viewer:
             for colour, found in self.picks.items()
         }
         self._list.content = "\n\n".join(
-            _told(colour, found) for colour, found in reversed(self.picks.items())
+            _markdown(colour, found) for colour, found in reversed(self.picks.items())
         )
 
     def _marker(self, side: int, colour: str, found: Pick) -> Any:
@@ -261,10 +261,10 @@ class Viewer:
         )
 
 
-def _told(colour: str, found: Pick) -> str:
-    """A pick in Markdown: where it is, in both shapes' own units, and the values there."""
+def _markdown(colour: str, found: Pick) -> str:
+    """A pick as Markdown: both points, and the values there."""
     rows = [
-        f"{'**picked**' if side == found.side else 'image'} | {_numbers(found.own[side])} "
+        f"{'**picked**' if side == found.side else 'image'} | {_numbers(found.coordinates[side])} "
         f"| {_numbers(found.uv[side])}"
         for side in (0, 1)
     ]
@@ -279,42 +279,44 @@ def _numbers(values: np.ndarray) -> str:
 
 @contextlib.contextmanager
 def serving(result: Result, host: str, port: int) -> Iterator[tuple[Viewer, str]]:
-    """The viewer on a port until the block ends, and its address.
+    """Serve the viewer until the block ends; gives the viewer and its address.
 
     Args:
-        result: what :func:`nsm.load` gave.
+        result: from :func:`nsm.load`.
         host: the address to listen on.
-        port: 0 for any that is free.
+        port: 0 for any free port.
 
     Raises:
-        NsmError: viser is not installed, or the port or address cannot be used.
+        NsmError: viser is not installed, ``out_of_range`` or ``port_in_use`` (key ``port``), or
+            ``address_not_available`` (key ``host``).
     """
     viser = needed("viser", "nsm view", "view")
-    _check(host, port)
-    with _quiet():
+    _check_address(host, port)
+    with _silenced():
         server = viser.ViserServer(host=host, port=port, verbose=False)
-    # a button of viser's page would put the server on the internet, through a service of others
+    # a button of viser's page would publish the server on the internet
     server.request_share_url = lambda *_, **__: None
     try:
         bound = server.get_port()
-        if port not in (0, bound):  # taken since it was checked
+        if port not in (0, bound):  # another process took it after the check
             raise _in_use(port)
         name = f"[{host}]" if ":" in host else host
         yield Viewer(result, server), f"http://{name}:{bound}"
     finally:
-        with _quiet():
+        with _silenced():
             server.stop()
 
 
-def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
-    """viser says at length where it listens, and that it has stopped."""
+def _silenced() -> contextlib.redirect_stdout[io.StringIO]:
+    """Hide viser's messages about starting and stopping."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
-def _check(host: str, port: int) -> None:
-    """Whether one can listen there: viser would try a thousand other ports, and then hang."""
+def _check_address(host: str, port: int) -> None:
+    """Raise an error if viser cannot listen there: it would try other ports and then hang."""
     if not 0 <= port < 2**16:
-        raise NsmError(f"port {port}: there are those from 1 to 65535, and 0 for any that is free")
+        reason = f"port {port}: give a number from 1 to 65535, or 0 for any free port"
+        raise NsmError(reason, kind="out_of_range", key="port")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(kind, socket.SOCK_STREAM) as trial:
@@ -323,8 +325,10 @@ def _check(host: str, port: int) -> None:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise _in_use(port) from error
-        raise NsmError(f"cannot listen on {host}, port {port}: {error.strerror}") from error
+        reason = f"cannot listen on {host}, port {port}: {error.strerror}; give another --host"
+        raise NsmError(reason, kind="address_not_available", key="host") from error
 
 
 def _in_use(port: int) -> NsmError:
-    return NsmError(f"port {port} is in use; give another, or --port 0 for any that is free")
+    reason = f"port {port} is in use; give another one, or --port 0 for any free port"
+    return NsmError(reason, kind="port_in_use", key="port")
