@@ -1,8 +1,8 @@
-"""What a training step costs, and how soon a training is where it should be.
+"""The cost of a training step, and the time of a training to a given error.
 
-Sides that are compared run in turn, round by round, and medians are taken. On a CPU, time is CPU
-time of the process (its threads together), so that other programs disturb little; on a GPU it is
-the clock, synchronised. The GPU is used where there is one.
+Variants that are compared run in turn, round by round; results are medians. On a CPU, time is the
+CPU time of the process (all its threads), which other programs disturb little; on a GPU it is
+wall-clock time, synchronized. The GPU is used where there is one.
 
     python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N] [--meshes FOLDER]
 """
@@ -30,7 +30,7 @@ import nsm
 from nsm.config import compose_config
 from nsm.data import OverfitData, Samples
 from nsm.energies.overfit import normal, position
-from nsm.maps import NeuralMap, build_map, together
+from nsm.maps import NeuralMap, batched, build_map
 from nsm.pipeline import build_overfit
 from nsm.pipeline.collection_map import build_collection_map
 from nsm.pipeline.pair_map import build_pair_map
@@ -48,10 +48,10 @@ PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 TASKS = ("overfit", "param", "pair_map", "collection_map")
 SETTINGS = ("paper", "default")
 ERRORS = (1.0, 0.5, 0.2, 0.1)  # RMS in percent of the diagonal
-SHARES = (0.5, 0.8, 0.9, 0.95)  # of the way from the domain's distortion to the least one found
+SHARES = (0.5, 0.8, 0.9, 0.95)  # of the decrease from the domain's distortion to the least found
 SURFACES = 3
-TOGETHER = (2, 4, 16)  # surfaces in one batch
-LENGTHS = (500, 1000, 2000, 4000, 8000)  # steps of a training that shall reach GOAL
+BATCHED = (2, 4, 16)  # surfaces in one batch
+LENGTHS = (500, 1000, 2000, 4000, 8000)  # steps of the trainings that try to reach GOAL
 GOAL = 0.1  # RMS in percent of the diagonal
 NEVER = 10**12  # steps
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -67,7 +67,7 @@ def clock() -> float:
 
 
 def in_turn(sides: dict[str, Step], rounds: int) -> dict[str, float]:
-    """Median seconds of each side; they take turns, after one round that does not count."""
+    """Median seconds of each variant; they take turns, after one round that does not count."""
     taken: dict[str, list[float]] = {name: [] for name in sides}
     for _ in range(rounds + 1):
         for name, step in sides.items():
@@ -86,22 +86,22 @@ def dome(rings: int = 30, height: float = 0.5) -> Surface:
 
 def config_of(task: str, settings: str) -> DictConfig:
     """The task's configuration; the paper's for maps is that of its pair maps."""
-    words = [f"task={task}", "seed=0"]
+    overrides = [f"task={task}", "seed=0"]
     if settings == "paper":
-        words += ["experiment=paper" if task == "overfit" else "experiment=paper_pair"]
+        overrides += ["experiment=paper" if task == "overfit" else "experiment=paper_pair"]
         if task == "param":
-            words += ["constraints=param", "constraints.lambda_triangles=0"]
-    return compose_config(words)
+            overrides += ["constraints=param", "loss_weights.triangles=0"]
+    return compose_config(overrides)
 
 
 def frozen_surface(settings: str, surface: Surface) -> NeuralSurface:
-    """A network of the settings that is taken for the surface: untrained, which costs as much."""
+    """An untrained network in place of the neural surface: it costs as much."""
     module = build_overfit(config_of("overfit", settings), surface)
     return NeuralSurface(surface, module.map.eval().requires_grad_(False).to(DEVICE))
 
 
 def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]:
-    """Loss and gradient of one step, ours and the published recipe's, of the same networks."""
+    """Loss and gradient of one step of the same networks: ours, and the published recipe's."""
     config, surface = config_of(task, settings), dome()
     data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
     data.trainer = None
@@ -152,7 +152,7 @@ def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]
 
 
 def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
-    """The matrix products that value, Jacobian and gradients of a network need, and their flops."""
+    """The matrix products of value, Jacobian and gradients of a network, and their flops."""
     layers = [m for m in net.modules() if isinstance(m, nn.Linear)]
     triples = [
         tuple(torch.randn(shape, device=DEVICE) for shape in shapes)
@@ -177,7 +177,7 @@ def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
 
 
 def peak_rate() -> float:
-    """Flops a second of one large matrix product, the best of some."""
+    """Flops per second of one large matrix product, the best of several."""
     side = 2048 if DEVICE.type == "cpu" else 8192
     a, b = torch.randn(side, side, device=DEVICE), torch.randn(side, side, device=DEVICE)
     best = float("inf")
@@ -189,7 +189,7 @@ def peak_rate() -> float:
 
 
 def costs(rounds: int) -> dict[str, Any]:
-    """(a) a step of each task beside the published recipe."""
+    """(a) A step of each task, and of the published recipe."""
     found = {}
     for settings in SETTINGS:
         for task in TASKS:
@@ -204,7 +204,7 @@ def costs(rounds: int) -> dict[str, Any]:
 
 
 def share_of_peak(rounds: int) -> dict[str, Any]:
-    """(b) a step of overfitting beside its bare matrix products and the machine's best rate."""
+    """(b) A step of overfitting, its matrix products alone, and the machine's best rate."""
     found: dict[str, Any] = {"peak_gflops": peak_rate() / 1e9}
     for settings in SETTINGS:
         config = config_of("overfit", settings)
@@ -224,7 +224,7 @@ def share_of_peak(rounds: int) -> dict[str, Any]:
 
 
 def growth(rounds: int) -> dict[str, Any]:
-    """(d) milliseconds of a step as one size changes."""
+    """(d) Milliseconds of a step as one size changes."""
 
     def of(net: NeuralMap, batch: int) -> Step:
         net, x = net.to(DEVICE), 2 * torch.rand(batch, 2, device=DEVICE) - 1
@@ -250,13 +250,13 @@ def growth(rounds: int) -> dict[str, Any]:
         data.trainer = None
         data.setup()
         uv, faces = torch.as_tensor(surface.uv, dtype=torch.float32), torch.as_tensor(surface.faces)
-        weakest, h = FoldBarrier(uv, faces).to(DEVICE), made().to(DEVICE)
+        barrier, h = FoldBarrier(uv, faces).to(DEVICE), made().to(DEVICE)
         planar = lambda x, h=h: h(x)[:, :2]  # noqa: E731
 
-        def fifty(data: Any = data, weakest: Any = weakest, planar: Any = planar) -> None:
-            for step in range(50):  # two looks at the triangles
+        def fifty(data: Any = data, barrier: Any = barrier, planar: Any = planar) -> None:
+            for step in range(50):  # the barrier looks at all triangles twice
                 data.batch(step)
-                weakest(planar, step).backward()
+                barrier(planar, step).backward()
 
         found[f"mesh/{len(surface.faces)}"] = 1e3 * in_turn({"": fifty}, 2)[""] / 50
     return found
@@ -268,7 +268,8 @@ def _held_out(data: OverfitData) -> Samples:
 
 
 def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limit: float) -> float:
-    """Train until the last step, the limit or a look says so; returns the seconds, looks aside."""
+    """Train to the last step, the limit, or until ``look`` says so; returns the seconds without
+    those of ``look``."""
     module.log_every = NEVER
     parts = module.configure_optimizers()
     optimiser, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
@@ -293,11 +294,11 @@ def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limi
 
 
 def times(mesh: str, limit: float) -> dict[str, Any]:
-    """(c) seconds until the held-out error, and then the held-out distortion, is low enough, the
-    start by least squares included.
+    """(c) Seconds to given held-out errors, and then to given held-out distortions, including the
+    initialization by least squares.
 
-    The default's schedule ends with its last step, so that it is trained once for each of some
-    lengths and the first good one counts; the published schedule has no end and is followed.
+    The default's schedule ends with its last step, so that it is trained for several lengths and
+    the first good one counts. The published schedule has no end and is measured as it goes.
     """
     surface = Surface.load(mesh)
     found: dict[str, Any] = {"surface": surface.name, "limit_seconds": limit, "overfit": {}}
@@ -362,7 +363,7 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
 
 
 def _stepping(module: Any) -> Any:
-    """The module with a step that is counted here: there is no trainer."""
+    """The module with its own count of steps, since there is no trainer."""
     cls = type(module)
     counted = property(lambda self: getattr(self, "_step", 0))
     module.__class__ = type(cls.__name__, (cls,), {"global_step": counted})
@@ -382,7 +383,7 @@ def _first(curve: list[tuple[float, float]], wanted: float) -> float | None:
 
 
 def memory() -> dict[str, Any]:
-    """(e) MiB that a step keeps for its backward pass, beside parameters; on a GPU, its peak."""
+    """(e) MiB that a step stores for its backward pass, without parameters; on a GPU, its peak."""
     found: dict[str, Any] = {}
     for task in TASKS:
         both = zip(("nsm", "published"), task_steps(task, "paper"), strict=True)
@@ -413,25 +414,25 @@ def _kept(step: Step) -> float:
 
 def batches(rounds: int) -> dict[str, Any]:
     """Milliseconds of a step of several surfaces, one after the other and in one batch, and of
-    one surface in compiled form."""
+    one surface with compiled evaluation."""
     config, surface = config_of("overfit", "default"), dome()
     data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
     data.trainer = None
     data.setup()
     batch = data.batch(0)
-    modules = [build_overfit(config, surface).to(DEVICE) for _ in range(max(TOGETHER))]
+    modules = [build_overfit(config, surface).to(DEVICE) for _ in range(max(BATCHED))]
 
     def step(one: Callable[[Tensor], tuple[Tensor, Tensor]], uv: Tensor) -> Step:
         def run() -> None:
             value, jacobian = one(uv)
             loss = position(value, batch.points.expand_as(value)).mean()
             turn = normal(jacobian, batch.normals.expand_as(value)).mean()
-            (loss + config.energy.lambda_normal * turn).backward()
+            (loss + config.loss_weights.normal * turn).backward()
 
         return run
 
     found: dict[str, Any] = {}
-    for k in TOGETHER:
+    for k in BATCHED:
         nets = [m.map for m in modules[:k]]
         singly = [step(net.value_and_jacobian, batch.uv) for net in nets]
 
@@ -439,37 +440,37 @@ def batches(rounds: int) -> dict[str, Any]:
             for one in steps:
                 one()
 
-        at_once = step(together(nets).value_and_jacobian, batch.uv.expand(k, -1, -1))
-        taken = in_turn({"one_by_one": one_by_one, "together": at_once}, rounds)
+        at_once = step(batched(nets).value_and_jacobian, batch.uv.expand(k, -1, -1))
+        taken = in_turn({"one_by_one": one_by_one, "batched": at_once}, rounds)
         found[str(k)] = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
-        found[str(k)]["ratio"] = taken["one_by_one"] / taken["together"]
+        found[str(k)]["ratio"] = taken["one_by_one"] / taken["batched"]
     net = modules[0].map
-    compiled, told = Compiled(print), "compiled" if DEVICE.type == "cpu" else "recorded"
+    compiled, kind = Compiled(print), "compiled" if DEVICE.type == "cpu" else "recorded"
     sides = {
         "as_it_is": step(net.value_and_jacobian, batch.uv),
-        told: step(lambda uv: compiled(net.value_and_jacobian, uv), batch.uv),  # type: ignore[arg-type,return-value]
+        kind: step(lambda uv: compiled(net.value_and_jacobian, uv), batch.uv),  # type: ignore[arg-type,return-value]
     }
     taken = in_turn(sides, 10 * rounds)
     found["compiled"] = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
-    found["compiled"]["ratio"] = taken["as_it_is"] / taken[told]
+    found["compiled"]["ratio"] = taken["as_it_is"] / taken[kind]
     print(json.dumps(found, indent=1), flush=True)
     return found
 
 
 def goals(meshes: Path) -> dict[str, Any]:
-    """Seconds by the clock, all in all, of what a user waits for: the bunny as a network of GOAL
-    RMS error, and a map of two animals whose networks are there."""
+    """Wall-clock seconds that a user waits: for the bunny as a network of GOAL RMS error, and for
+    a map of two animals whose networks are trained."""
     found: dict[str, Any] = {"goal_percent": GOAL}
     bunny = Surface.load(str(meshes / "stanford-bunny.obj"))
     marks = [str(meshes / "landmarks" / f"shrec07-{k}.vts") for k in (384, 388)]
     animals = [str(meshes / f"shrec07-{k}.off") for k in (384, 388)]
     ready = nsm.map_pair(*animals, marks, overrides=["trainer.max_steps=1"], progress=False)
     for compiled in (False, True):
-        words = [f"trainer.compile={str(compiled).lower()}"]
+        settings = [f"trainer.compile={str(compiled).lower()}"]
         runs = []
         for steps in LENGTHS:
             start = time.perf_counter()
-            length = [*words, f"trainer.max_steps={steps}"]
+            length = [*settings, f"trainer.max_steps={steps}"]
             phi = nsm.overfit(bunny, overrides=length, progress=False)
             seconds, rms = time.perf_counter() - start, phi.metrics["rms_percent"]
             runs.append({"steps": steps, "seconds": seconds, "rms_percent": rms})
@@ -477,7 +478,11 @@ def goals(meshes: Path) -> dict[str, Any]:
                 break
         start = time.perf_counter()
         f = nsm.map_pair(
-            ready.source, ready.target, ready.landmarks.tolist(), overrides=words, progress=False
+            ready.source,
+            ready.target,
+            ready.landmarks.tolist(),
+            overrides=settings,
+            progress=False,
         )
         seconds = time.perf_counter() - start
         kept = ("symmetric_dirichlet_median", "flipped_percent", "landmark_error_max_percent")
@@ -490,24 +495,25 @@ def goals(meshes: Path) -> dict[str, Any]:
 
 
 def page(results: dict[str, Any]) -> str:
-    """The results as a page of the documentation."""
+    """The results as the page docs/performance.md."""
     on = results["machine"]
     lines = [
         "# Performance",
         "",
-        f"Made by `make bench-speed` on {on['device']}, {on['threads']} thread(s), torch "
-        f"{on['torch']}, float32; {on['clock']}. Sides that are compared ran in turn; medians.",
+        f"`make bench-speed` measured these figures on {on['device']} with {on['threads']} "
+        f"thread(s), torch {on['torch']} and float32. Times are {on['clock']}, medians of "
+        "variants that ran in turn.",
     ]
     if "costs" in results:
         lines += [
             "",
             "## A step of each task",
             "",
-            "Loss and gradient, beside a plain restatement of the published recipe (one "
-            "`autograd.grad` per output, batched SVD and explicit inverse), with the same networks "
+            "Loss and gradient, compared with a plain restatement of the published recipe (one "
+            "`autograd.grad` per output, batched SVD and explicit inverse) for the same networks "
             f"and batch. The collection has {SURFACES} surfaces.",
             "",
-            "| task, settings | published, ms | nsm, ms | times as fast |",
+            "| task, settings | published, ms | nsm, ms | speed-up |",
             "|---|---|---|---|",
         ]
         lines += [
@@ -520,8 +526,8 @@ def page(results: dict[str, Any]) -> str:
             "",
             "## Share of the machine's peak",
             "",
-            "A step of overfitting beside the bare matrix products of its shapes, forward and "
-            "backward, and beside the rate of one large product "
+            "A step of overfitting, compared with its matrix products alone, forward and backward, "
+            "and with the rate of one large product "
             f"({results['peak']['peak_gflops']:.0f} GFLOP/s).",
             "",
             "| settings | step, ms | products, ms | step / products | share of peak | "
@@ -553,7 +559,7 @@ def page(results: dict[str, Any]) -> str:
                 "",
                 f"task={of} on {t['surface']}, on held-out points."
                 + (
-                    f" The domain itself has {t['param']['distortion_of_domain']:.3f}."
+                    f" The domain itself has distortion {t['param']['distortion_of_domain']:.3f}."
                     if of == "param"
                     else ""
                 ),
@@ -573,7 +579,7 @@ def page(results: dict[str, Any]) -> str:
             "width": "width, batch 1,024, 3 layers",
             "depth": "layers, batch 1,024, width 128",
             "surfaces": "surfaces of a collection, settings of the paper",
-            "mesh": "triangles: samples and the watch on folds",
+            "mesh": "triangles: samples and the fold barrier",
         }
         lines += [f"| {names[k]} | {', '.join(v)} |" for k, v in groups.items()]
     if "batches" in results:
@@ -584,27 +590,28 @@ def page(results: dict[str, Any]) -> str:
             "",
             "Loss and gradient of overfitting with the default settings.",
             "",
-            "| surfaces | one by one, ms | together, ms | times as fast |",
+            "| surfaces | one by one, ms | batched, ms | speed-up |",
             "|---|---|---|---|",
         ]
         lines += [
             f"| {k} | {b[str(k)]['one_by_one_milliseconds']:.1f} | "
-            f"{b[str(k)]['together_milliseconds']:.1f} | {b[str(k)]['ratio']:.2f} |"
-            for k in TOGETHER
+            f"{b[str(k)]['batched_milliseconds']:.1f} | {b[str(k)]['ratio']:.2f} |"
+            for k in BATCHED
         ]
         lines += [
             "",
-            "In compiled form (`trainer.compile=true`) a step is "
+            "With compiled evaluation (`trainer.compile=true`) a step is "
             f"{b['compiled']['ratio']:.2f} times as fast.",
         ]
     if "goals" in results:
         g = results["goals"]
         lines += [
             "",
-            "## What a user waits for",
+            "## Waiting time",
             "",
-            f"By the clock: the bunny until its RMS error is {g['goal_percent']} % of the "
-            "diagonal, by trainings of growing length; a map of two animals from their networks.",
+            f"Wall-clock time until the RMS error of the bunny is {g['goal_percent']} % of the "
+            "diagonal, for trainings of growing length; and of a map of two animals from their "
+            "networks.",
             "",
             "| evaluation | bunny: steps, RMS, seconds | map: median distortion, flips, seconds |",
             "|---|---|---|",
@@ -621,7 +628,7 @@ def page(results: dict[str, Any]) -> str:
             "",
             "## Memory",
             "",
-            "What a step with the paper's settings keeps for its backward pass, MiB.",
+            "What a step with the paper's settings stores for its backward pass, in MiB.",
             "",
             "| task | published | nsm | ratio |",
             "|---|---|---|---|",
@@ -636,7 +643,7 @@ def page(results: dict[str, Any]) -> str:
 
 
 def write_page() -> None:
-    """Make the page of the documentation anew of the results that are kept."""
+    """Write docs/performance.md from the stored results."""
     PAGE.write_text(page(json.loads((RESULTS / "speed.json").read_text())))
 
 
@@ -645,13 +652,17 @@ PARTS = ("costs", "peak", "growth", "batches", "memory", "times", "goals")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mesh", default="terrain", help="of the time to an error")
+    parser.add_argument("--mesh", default="terrain", help="mesh for the time to an error")
     parser.add_argument("--seconds", type=float, default=120.0, help="limit of one training")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--meshes", type=Path, help="folder of bunny and animals: adds the goals")
+    parser.add_argument(
+        "--meshes", type=Path, help="folder of bunny and animals: adds the waiting times"
+    )
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="all by default")
-    parser.add_argument("--output", type=Path, help="folder of the JSON; also no page is written")
+    parser.add_argument(
+        "--output", type=Path, help="folder of the JSON file; then no page is written"
+    )
     arguments = parser.parse_args()
     parts = arguments.parts or [p for p in PARTS if p != "goals" or arguments.meshes]
     if "goals" in parts and not (arguments.meshes and arguments.meshes.is_dir()):
@@ -666,7 +677,7 @@ def main() -> None:
         "processor": platform.machine(),
         "torch": torch.__version__,
         "threads": arguments.threads,
-        "clock": "time by the clock" if cuda else "CPU time of the process",
+        "clock": "wall-clock time" if cuda else "CPU time of the process",
     }
     make: dict[str, Callable[[], dict[str, Any]]] = {
         "costs": lambda: costs(arguments.rounds),
@@ -677,7 +688,7 @@ def main() -> None:
         "times": lambda: times(arguments.mesh, arguments.seconds),
         "goals": lambda: goals(arguments.meshes),
     }
-    for part in parts:  # kept one by one: a long run that is stopped has its parts
+    for part in parts:  # stored one by one: an interrupted run keeps what it has
         found = make[part]()
         results = json.loads(output.read_text()) if output.exists() else {}
         results = {**results, "machine": machine, part: found}
