@@ -23,14 +23,16 @@ import numpy as np
 import published
 import scale
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor, nn
+from training import samples_of
 
 import nsm
 from nsm.config import compose_config
-from nsm.data import OverfitData, Samples
+from nsm.data import Samples, SurfaceData
 from nsm.energies.overfit import normal, position
-from nsm.maps import NeuralMap, batched, build_map
+from nsm.maps import NeuralMap, batched
+from nsm.maps.encodings import Identity
 from nsm.pipeline import build_overfit
 from nsm.pipeline.collection_map import build_collection_map
 from nsm.pipeline.pair_map import build_pair_map
@@ -103,7 +105,7 @@ def frozen_surface(settings: str, surface: Surface) -> NeuralSurface:
 def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]:
     """Loss and gradient of one step of the same networks: ours, and the published recipe's."""
     config, surface = config_of(task, settings), dome()
-    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+    data = samples_of(config, surface)
     data.trainer = None
     data.setup()
     batch = Samples(*(part.to(DEVICE) for part in data.batch(0)))
@@ -161,7 +163,7 @@ def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
             for m in layers
         )
     ]
-    bare = isinstance(net.encoding, type(build_map({"encoding": {"name": "identity"}}).encoding))
+    bare = isinstance(net.encoding, Identity)
 
     def run() -> None:
         for a, w, _ in triples:
@@ -237,7 +239,7 @@ def growth(rounds: int) -> dict[str, Any]:
         return run
 
     def made(width: int = 128, depth: int = 3) -> NeuralMap:
-        return build_map({"width": width, "depth": depth, "block": "plain"})
+        return NeuralMap(3, width=width, depth=depth, block="plain")
 
     sides = {f"batch/{n}": of(made(), n) for n in (256, 1024, 4096, 16384)}
     sides |= {f"width/{n}": of(made(width=n), 1024) for n in (32, 64, 128, 256, 512)}
@@ -246,7 +248,7 @@ def growth(rounds: int) -> dict[str, Any]:
     found = {key: 1e3 * value for key, value in in_turn(sides, rounds).items()}
     for rings in (30, 100, 300, 580):
         surface = dome(rings)
-        data = OverfitData(surface, batch_size=1024)
+        data = SurfaceData(surface, batch_size=1024)
         data.trainer = None
         data.setup()
         uv, faces = torch.as_tensor(surface.uv, dtype=torch.float32), torch.as_tensor(surface.faces)
@@ -262,12 +264,12 @@ def growth(rounds: int) -> dict[str, Any]:
     return found
 
 
-def _held_out(data: OverfitData) -> Samples:
+def _held_out(data: SurfaceData) -> Samples:
     parts = list(data.val_dataloader())
     return Samples(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
-def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limit: float) -> float:
+def _trained(module: Any, data: SurfaceData, config: DictConfig, look: Any, limit: float) -> float:
     """Train to the last step, the limit, or until ``look`` says so; returns the seconds without
     those of ``look``."""
     module.log_every = NEVER
@@ -311,7 +313,7 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
         start = clock()
         module = _stepping(make(config, phi or surface).to(DEVICE))
         built = clock() - start
-        data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+        data = samples_of(config, surface)
         data.trainer = None
         data.setup()
         return config, module, data, built
@@ -416,7 +418,7 @@ def batches(rounds: int) -> dict[str, Any]:
     """Milliseconds of a step of several surfaces, one after the other and in one batch, and of
     one surface with compiled evaluation."""
     config, surface = config_of("overfit", "default"), dome()
-    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+    data = samples_of(config, surface)
     data.trainer = None
     data.setup()
     batch = data.batch(0)

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from pytorch_lightning.callbacks import Callback
 
-from nsm.data import OverfitData
+from nsm.data import SurfaceData
+from nsm.instantiation import made
 from nsm.pipeline import build_overfit
 from nsm.surfaces import Surface
 from nsm.tasks import Overfit
@@ -66,10 +67,18 @@ class OnTheClock(Clock):
         def by_time(factor: Any) -> Any:
             return lambda _: factor(pl_module.hparams["max_steps"] * self.progress)
 
-        if pl_module.hparams["scheduler"]["name"] == "cosine":
+        if pl_module.hparams["scheduler"]["_target_"].endswith(".Cosine"):
             for configured in trainer.lr_scheduler_configs:
                 scheduler: Any = configured.scheduler
                 scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
+
+
+def samples_of(
+    config: DictConfig, surface: Surface, kind: type[SurfaceData] = SurfaceData
+) -> SurfaceData:
+    """The data module of a configuration, or one of another class with its settings."""
+    settings = {key: value for key, value in config.data.items() if key != "_target_"}
+    return kind(surface, made(config.sampler), **settings, seed=config.seed)
 
 
 def train(
@@ -90,8 +99,7 @@ def train(
     """
     start = time.process_time()
     module = exchanged(build_overfit(config, surface))
-    samples = getattr(module, "samples", OverfitData)
-    data = samples(surface, **OmegaConf.to_container(config.data), seed=config.seed)
+    data = samples_of(config, surface, getattr(module, "samples", SurfaceData))
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
             accelerator="cpu",
