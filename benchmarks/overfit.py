@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from nsm.domains import Surface
 from rich.console import Console
 from training import MESHES, Clock, OnTheClock, surface_of, train
 
@@ -25,7 +26,6 @@ from nsm.config import compose_config
 from nsm.pipeline import quiet_lightning
 from nsm.results import atomic_write, overfit_metrics
 from nsm.results.callbacks import GradientWatch
-from nsm.surfaces import Surface
 
 RESULT = Path(__file__).parent / "results" / "overfit.json"
 

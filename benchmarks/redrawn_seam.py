@@ -16,20 +16,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
-
-import nsm
-from nsm.results import by_file_vertex
-from nsm.surfaces import topology
-from nsm.surfaces.correspondence import (
+from nsm.domains.base import Keys
+from nsm.domains.common_seams import (
     boundary_keys,
     corresponding_paths,
     edge_lengths,
     turned_alike,
 )
+from nsm.domains.joint_preparation import common_fractions
+from scipy.spatial import cKDTree
+
+import nsm
+from nsm.results import by_file_vertex
+from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths
-from nsm.surfaces.domain import Keys
-from nsm.surfaces.joint_preparation import common_fractions
 from nsm.surfaces.landmarks import read_landmarks
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import CleanMesh, clean

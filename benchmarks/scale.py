@@ -76,21 +76,26 @@ class Stages:
 
     def __init__(self) -> None:
         self.taken: dict[str, dict[str, float]] = {}
+        self.within = False
 
-    def around(self, module: Any, name: str, stage: str) -> None:
-        """Count each call of ``module.name`` for a stage."""
-        inner: Callable[..., Any] = getattr(module, name)
+    def around(self, owner: Any, name: str, stage: str) -> None:
+        """Count each call of ``owner.name``, a function or method, for a stage, unless it is part
+        of another stage."""
+        inner: Callable[..., Any] = getattr(owner, name)
 
         def measured(*args: Any, **kwargs: Any) -> Any:
-            start = time.process_time()
+            if self.within:
+                return inner(*args, **kwargs)
+            start, self.within = time.process_time(), True
             try:
                 return inner(*args, **kwargs)
             finally:
+                self.within = False
                 entry = self.taken.setdefault(stage, {"cpu_seconds": 0.0, "peak_mib": 0.0})
                 entry["cpu_seconds"] += time.process_time() - start
                 entry["peak_mib"] = peak_mib()
 
-        setattr(module, name, measured)
+        setattr(owner, name, measured)
 
 
 def peak_mib() -> float:
@@ -99,17 +104,18 @@ def peak_mib() -> float:
 
 def overfit(mesh: Callable[[], shapes.Mesh], folder: Path) -> dict[str, Any]:
     """task=overfit from a raw mesh."""
-    from nsm.pipeline import overfit as pipeline
+    from nsm.pipeline import runner
+    from nsm.pipeline.overfit import OverfitTask
 
     stages = Stages()
-    for name, stage in (
-        ("configured_surface", "preparation"),
-        ("train", f"training, {STEPS} steps"),
-        ("overfit_metrics", "figures"),
-        ("save_surface", "saving"),
-        ("_write_artefacts", "meshes and pictures"),
+    for owner, name, stage in (
+        (OverfitTask, "prepare", "preparation"),
+        (runner, "trained", f"training, {STEPS} steps"),
+        (OverfitTask, "measure", "figures"),
+        (OverfitTask, "save", "saving"),
+        (OverfitTask, "write_artefacts", "meshes and pictures"),
     ):
-        stages.around(pipeline, name, stage)
+        stages.around(owner, name, stage)
     file = write_obj(folder / "mesh.obj", mesh())
     settings = ["task=overfit", f"surface.path={file}", f"trainer.max_steps={STEPS}"]
     found = whole_run(settings, folder / "run", stages)
@@ -118,19 +124,19 @@ def overfit(mesh: Callable[[], shapes.Mesh], folder: Path) -> dict[str, Any]:
 
 def collection(folder: Path) -> dict[str, Any]:
     """task=collection_map of many surfaces, all ordered pairs of them."""
-    from nsm.pipeline import collection_map as pipeline
-    from nsm.pipeline import resolve_inputs as inputs
+    from nsm.pipeline import resolve_inputs, runner
+    from nsm.pipeline.collection_map import CollectionMapTask
 
     stages = Stages()
-    for module, name, stage in (
-        (inputs, "prepare_jointly", "preparation"),
-        (inputs, "made_batched", f"neural surfaces, {PHI_STEPS} steps"),
-        (pipeline, "fitted", f"training, {COLLECTION_STEPS} steps"),
-        (pipeline, "certified", "certificates"),
-        (pipeline, "collection_metrics", "figures"),
-        (pipeline, "_write_artefacts", "meshes and pictures"),
+    for owner, name, stage in (
+        (resolve_inputs, "prepare_jointly", "preparation"),
+        (resolve_inputs, "cached_surfaces", f"neural surfaces, {PHI_STEPS} steps"),
+        (runner, "trained", f"training, {COLLECTION_STEPS} steps"),
+        (runner, "certified", "certificates"),
+        (CollectionMapTask, "measure", "figures"),
+        (CollectionMapTask, "write_artefacts", "meshes and pictures"),
     ):
-        stages.around(module, name, stage)
+        stages.around(owner, name, stage)
     files = [write_obj(folder / f"bowl{k}.obj", bowl(k)) for k in range(SURFACES)]
     landmarks = folder / "landmarks.json"
     landmarks.write_text(json.dumps([LANDMARKS] * SURFACES))

@@ -23,9 +23,11 @@ import numpy as np
 import published
 import scale
 import torch
+from nsm.domains import Surface
+from nsm.domains.surface import as_it_lies
 from omegaconf import DictConfig
 from torch import Tensor, nn
-from training import samples_of
+from training import module_of, samples_of
 
 import nsm
 from nsm.config import compose_config
@@ -33,15 +35,8 @@ from nsm.data import Samples, SurfaceData
 from nsm.energies.overfit import normal, position
 from nsm.maps import NeuralMap, batched
 from nsm.maps.encodings import Identity
-from nsm.pipeline import build_overfit
-from nsm.pipeline.collection_map import build_collection_map
-from nsm.pipeline.pair_map import build_pair_map
-from nsm.pipeline.param import build_param
 from nsm.results import NeuralSurface, atomic_write
-from nsm.surfaces import Surface
-from nsm.surfaces.joint_preparation import matched_landmarks
 from nsm.surfaces.shapes import ring_mesh
-from nsm.surfaces.surface import as_it_lies
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.fold_barrier import FoldBarrier
 
@@ -98,7 +93,7 @@ def config_of(task: str, settings: str) -> DictConfig:
 
 def frozen_surface(settings: str, surface: Surface) -> NeuralSurface:
     """An untrained network in place of the neural surface: it costs as much."""
-    module = build_overfit(config_of("overfit", settings), surface)
+    module = module_of(config_of("overfit", settings), surface)
     return NeuralSurface(surface, module.map.eval().requires_grad_(False).to(DEVICE))
 
 
@@ -113,31 +108,31 @@ def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]
     none = [np.zeros(0, dtype=np.int64)] * k
     module: Any
     if task == "overfit":
-        module = build_overfit(config, surface).to(DEVICE)
+        module = module_of(config, surface).to(DEVICE)
 
         def theirs() -> Tensor:
             return published.overfit(module.map, *batch)
 
     elif task == "param":
-        module = build_param(config, phis[0]).to(DEVICE)
+        module = module_of(config, phis[0]).to(DEVICE)
 
         def theirs() -> Tensor:
             return published.param(phis[0].map, module.map, batch.uv)
 
     elif task == "pair_map":
-        pair = matched_landmarks([surface] * 2, none[:2])
-        module = build_pair_map(config, phis[0], phis[1], pair).to(DEVICE)
+        module = module_of(config, phis[0], phis[1], none[:2]).to(DEVICE)
+        boundary = module.domain.boundary_samples().to(DEVICE)
 
         def theirs() -> Tensor:
-            return published.pair_map(phis[0].map, phis[1].map, module.map, batch.uv, module.rim)
+            return published.pair_map(phis[0].map, phis[1].map, module.map, batch.uv, boundary)
 
     else:
-        matched = matched_landmarks([surface] * k, none)
-        module = build_collection_map(config, phis, matched)[0].to(DEVICE)
+        module = module_of(config, phis, none).to(DEVICE)
+        boundary = module.domain.boundary_samples().to(DEVICE)
 
         def theirs() -> Tensor:
             return published.collection_map(
-                [p.map for p in phis], list(module.map), batch.uv, module.rim
+                [p.map for p in phis], list(module.map), batch.uv, boundary
             )
 
     module.log_every = NEVER  # there is no logger here
@@ -210,7 +205,7 @@ def share_of_peak(rounds: int) -> dict[str, Any]:
     found: dict[str, Any] = {"peak_gflops": peak_rate() / 1e9}
     for settings in SETTINGS:
         config = config_of("overfit", settings)
-        net = build_overfit(config, dome()).map
+        net = module_of(config, dome()).map
         bare, flops = products(net, config.data.batch_size)
         ours = task_steps("overfit", settings)[0]
         taken = in_turn({"nsm": ours, "products": bare}, rounds)
@@ -309,9 +304,8 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
         config = config_of(name, settings)
         if steps is not None:
             config.trainer.max_steps = steps
-        make = build_overfit if name == "overfit" else build_param
         start = clock()
-        module = _stepping(make(config, phi or surface).to(DEVICE))
+        module = _stepping(module_of(config, phi or surface).to(DEVICE))
         built = clock() - start
         data = samples_of(config, surface)
         data.trainer = None
@@ -339,19 +333,21 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
             "best_percent": min(value for _, value in curve),
         }
 
-    def distortion(module: Any, uv: Tensor) -> float:
+    def distortion(module: Any, held: Samples) -> float:
         with torch.no_grad():
-            return float(module._distortion(uv)[0].mean)
+            return float(module._evaluated(held)[0].mean)
 
     curves = {"default": [], "paper": []}
     for steps in (25, 50, 100, 200, 400):
         config, module, data, _ = task("param", "default", steps, phi)
-        uv = _held_out(data).uv
-        before = distortion(module, uv)
+        held = _held_out(data)
+        before = distortion(module, held)
         spent = _trained(module, data, config, None, limit)
-        curves["default"].append((spent, distortion(module, uv)))
+        curves["default"].append((spent, distortion(module, held)))
     config, module, data, _ = task("param", "paper", None, phi)
-    _trained(module, data, config, _follow(curves["paper"], lambda: distortion(module, uv)), limit)
+    _trained(
+        module, data, config, _follow(curves["paper"], lambda: distortion(module, held)), limit
+    )
     least = min(value for curve in curves.values() for _, value in curve)
     wanted = [before + share * (least - before) for share in SHARES]
     found["param"] = {"distortion_of_domain": before, "least_distortion": least}
@@ -422,7 +418,7 @@ def batches(rounds: int) -> dict[str, Any]:
     data.trainer = None
     data.setup()
     batch = data.batch(0)
-    modules = [build_overfit(config, surface).to(DEVICE) for _ in range(max(BATCHED))]
+    modules = [module_of(config, surface).to(DEVICE) for _ in range(max(BATCHED))]
 
     def step(one: Callable[[Tensor], tuple[Tensor, Tensor]], uv: Tensor) -> Step:
         def run() -> None:

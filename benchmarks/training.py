@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
+from nsm.domains import Surface
 from omegaconf import DictConfig
 from pytorch_lightning.callbacks import Callback
+from rich.console import Console
 
 from nsm.data import SurfaceData
 from nsm.instantiation import made
-from nsm.pipeline import build_overfit
-from nsm.surfaces import Surface
+from nsm.pipeline import built, make_task
 from nsm.tasks import Overfit
 
 MESHES = {
@@ -73,6 +74,13 @@ class OnTheClock(Clock):
                 scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
 
 
+def module_of(config: DictConfig, *inputs: Any) -> Any:
+    """The module that a task trains, for prepared inputs: those of the task's method ``use``."""
+    task: Any = make_task(config, Console(quiet=True))
+    task.use(*inputs)
+    return built(task)
+
+
 def samples_of(
     config: DictConfig, surface: Surface, kind: type[SurfaceData] = SurfaceData
 ) -> SurfaceData:
@@ -98,7 +106,7 @@ def train(
         exchanged: from nsm's module to the one that is trained.
     """
     start = time.process_time()
-    module = exchanged(build_overfit(config, surface))
+    module = exchanged(module_of(config, surface))
     data = samples_of(config, surface, getattr(module, "samples", SurfaceData))
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
