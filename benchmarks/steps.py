@@ -192,7 +192,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "batch 2,048": ["data.batch_size=2048"],
         "batch 8,192": ["data.batch_size=8192"],
     },
-    "optimiser": {
+    "optimizer": {
         "AdamW": ["optimizer=adamw", "optimizer.lr=3e-3", "optimizer.encoding_lr=3e-2"],
         "RMSProp": ["optimizer=rmsprop", "optimizer.lr=3e-3", "+optimizer.encoding_lr=3e-2"],
         "SGD": ["optimizer=sgd", "optimizer.lr=3e-2", "+optimizer.encoding_lr=10"],
