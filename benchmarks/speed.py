@@ -269,16 +269,16 @@ def _trained(module: Any, data: SurfaceData, config: DictConfig, look: Any, limi
     those of ``look``."""
     module.log_every = NEVER
     parts = module.configure_optimizers()
-    optimiser, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
+    optimizer, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
     clip, spent, seen, step = config.trainer.gradient_clip, 0.0, 0.0, 0
     module._step = 0
     while step < config.trainer.max_steps and spent < limit:
         start = clock()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         module.training_step(data.batch(step), 0).backward()
         if clip:
             nn.utils.clip_grad_norm_(module.map.parameters(), clip)
-        optimiser.step()
+        optimizer.step()
         schedule.step()
         step += 1
         module._step = step
