@@ -97,7 +97,7 @@ def residuals(network: NeuralMap, batch: Samples, normal_weight: float) -> Tenso
     act = network.activation
     for layer in network.layers[:-1]:
         value, by_u, by_v = linear(layer, stack).unbind()
-        value, slope = act.formulas.value_and_slope(value, **act.parameters_)
+        value, slope = act.value_and_slope(value)
         stack = torch.stack([value, by_u * slope, by_v * slope])
     stack = linear(network.output, stack)
     if network.linear_skip is not None:
@@ -434,7 +434,7 @@ class HashGrid(nn.Module):
 
     def __init__(
         self,
-        in_dim: int,
+        in_dim: int = 2,
         levels: int = 8,
         coarsest: int = 16,
         finest: int = 512,
