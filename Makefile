@@ -1,4 +1,5 @@
-# make demo: environment and a neural surface of real terrain; make test: environment and tests.
+# make demo: create .venv and compute a neural surface of real terrain.
+# make test: create .venv and run linters, type checks and tests.
 PYTHON ?= python3
 BIN := .venv/bin
 
@@ -15,33 +16,33 @@ check: .venv/.nsm-dev
 	$(BIN)/ruff format --check nsm hydra_plugins tests benchmarks docs
 	$(BIN)/mypy
 
-# The pages of docs/, the reference of settings made of conf/, the API: site/index.html.
+# Build the pages of docs/ with the reference of settings and of the API: site/index.html.
 docs: .venv/.nsm-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "the documentation is in site/index.html"
 
-# Error against time, default beside paper settings: about an hour. MESHES names the folder.
+# Error against time, default and paper settings: about an hour. MESHES names the folder of meshes.
 bench: .venv/.nsm-dev
 	$(BIN)/python benchmarks/overfit.py $(if $(MESHES),--meshes $(MESHES))
 
-# What makes a training need fewer steps: a minute for each mesh and trial. MESHES as above.
+# What makes training need fewer steps: a minute for each mesh and trial. MESHES as above.
 bench-steps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/steps.py $(if $(MESHES),--meshes $(MESHES))
 
-# Maps between the meshes of the folder MESHES, and flattening beside libigl's: over an hour.
+# Maps between the meshes in MESHES, and flattening compared with libigl: over an hour.
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
 
-# Each activation in one network, its wrinkles, and a report on the runs: half an hour.
+# One network with each activation, its wrinkles, and a report on the runs: half an hour.
 bench-activation: .venv/.nsm-dev
 	$(BIN)/python benchmarks/activation.py $(if $(MESHES),--meshes $(MESHES))
 
-# The command on hostile meshes, files and disks: ten minutes on two cores.
+# The command on difficult meshes, files and disks: ten minutes on two cores.
 torture: .venv/.nsm-dev
 	$(BIN)/python benchmarks/torture
 
-# Each reader of files is fuzzed for so many seconds; each property is tried on so many times the
-# examples of the tests.
+# Fuzz each reader of files for FUZZ_SECONDS; test each property on FUZZ_EXAMPLES times the examples
+# of the tests.
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks surface map pair collection checkpoint
 FUZZ_EXAMPLES ?= 20
@@ -52,12 +53,12 @@ fuzz: .venv/.nsm-dev
 	NSM_EXAMPLES=$(FUZZ_EXAMPLES) $(BIN)/python -m pytest -n auto tests/test_properties.py \
 	  tests/test_corpus.py tests/energies tests/maps
 
-# Cost of a step and time to an error, ours beside the published recipe and settings: ten minutes;
-# on the GPU where there is one. MESHES adds what a user waits for with bunny and animals.
+# Cost of a step and time to an error, compared with the published recipe and settings: ten minutes;
+# on the GPU where there is one. MESHES adds the waiting times for bunny and animals.
 bench-speed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/speed.py $(if $(MESHES),--meshes $(MESHES))
 
-# Meshes of a million faces and a collection of 20 surfaces, time and memory: half an hour.
+# Time and memory of meshes of a million faces and of a collection of 20 surfaces: half an hour.
 bench-scale: .venv/.nsm-dev
 	$(BIN)/python benchmarks/scale.py
 

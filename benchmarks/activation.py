@@ -1,8 +1,8 @@
-"""The activation of the network: how near, and how wrinkled, the neural surface becomes.
+"""The activation of the network: distance and wrinkles of the neural surface.
 
-One network of the paper's kind (residual, fully connected, no feature grid) is overfitted to one
-mesh with each activation, all else alike, and the wrinkles are measured as
-:mod:`nsm.results.wrinkles` defines them. Runs that are complete are not repeated.
+A network of the paper's kind (residual, fully connected, no feature grid) is overfitted to one
+mesh with each activation and otherwise equal settings; :mod:`nsm.results.wrinkles` defines the
+measure of wrinkles. Complete runs are not repeated.
 
     python benchmarks/activation.py --meshes FOLDER
 """
@@ -34,9 +34,9 @@ SETTINGS = [
     "encoding=fourier",
     "data.batch_size=1000",
     f"trainer.max_steps={STEPS}",
-    "logger.pictures=0",
+    "trainer.log_pictures=0",
 ]
-# sin(ωz) needs the start that was published with it
+# sin(ωz) needs the initialization that was published with it
 OWN = {"sine": ["map.initialization=siren"]}
 ACTIVATIONS = (
     "softplus",
@@ -66,7 +66,7 @@ def _picture(view: View, vertices: np.ndarray, faces: np.ndarray, name: str) -> 
 
 
 def _pictures(name: str, neural: NeuralSurface) -> None:
-    """The trunk of the surface, where the source is smooth, on triangles far finer than its own."""
+    """Draw the trunk of the animal, where the source is smooth, on a much finer mesh."""
     surface = neural.surface
     across, up = (surface.vertices @ View(surface.vertices, _SIDE).frame.T).T[:2]
     trunk = np.ones(len(across), dtype=bool)
@@ -84,8 +84,8 @@ def _pictures(name: str, neural: NeuralSurface) -> None:
 
 def _table(runs: dict[str, dict[str, dict[str, float]]]) -> str:
     lines = ["| activation | " + " | ".join(COLUMNS.values()) + " |", "|---" * 5 + "|"]
-    for name, words in runs.items():
-        cells = [f"{words['metrics'][key]:.3f}" for key in COLUMNS]
+    for name, found in runs.items():
+        cells = [f"{found['metrics'][key]:.3f}" for key in COLUMNS]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -104,10 +104,10 @@ def main() -> None:
     for name in arguments.names:
         folder = arguments.folder / name
         if not (folder / "metrics.json").exists():
-            words = [mesh, f"activation={name}", *SETTINGS, *OWN.get(name, [])]
-            run(compose_config(words), folder)
-        words = json.loads((folder / "metrics.json").read_text())
-        kept = {key: words[key] for key in ("steps", "metrics")}
+            settings = [mesh, f"activation={name}", *SETTINGS, *OWN.get(name, [])]
+            run(compose_config(settings), folder)
+        found = json.loads((folder / "metrics.json").read_text())
+        kept = {key: found[key] for key in ("steps", "metrics")}
         results[name] = {"settings": [*SETTINGS, *OWN.get(name, [])], **kept}
         _pictures(name, load_surface(folder))
     text = json.dumps({"surface": SURFACE, "runs": results}, indent=1) + "\n"

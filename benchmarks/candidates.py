@@ -1,7 +1,8 @@
-"""Pieces that trials of steps.py put in the place of the product's: none is a setting of nsm.
+"""Alternatives that trials of steps.py compare with parts of nsm; none is a setting of nsm.
 
-Each candidate is the task of overfitting with one piece exchanged. The words of a trial name it as
-``candidate=NAME``, with ``candidate.SETTING=VALUE``; an encoding is registered, as users' own are.
+Each candidate is the task of overfitting with one part replaced. A trial selects it with
+``candidate=NAME`` and ``candidate.SETTING=VALUE``; the encoding is an option of the group
+``encoding``, as users' own encodings are.
 """
 
 from __future__ import annotations
@@ -12,45 +13,46 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from hydra.core.config_store import ConfigStore
+from nsm.domains import Surface
+from nsm.tasks.schedules import scheduled
 from omegaconf import OmegaConf
 from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-import nsm
-from nsm.data import OverfitData, Samples, SurfaceSampler
-from nsm.domains import Surface
+from nsm.data import Samples, SurfaceData, SurfaceSampler
 from nsm.energies.overfit import NORMAL_FLOOR, normal, position
 from nsm.maps import NeuralMap, SplineGrid
 from nsm.maps.encodings import value_and_jacobian_stack
 from nsm.tasks import Overfit
-from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer, scheduled
+from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer
 
 
 class Candidate(Overfit):
-    """Overfitting with a piece exchanged.
+    """Overfitting with one part replaced.
 
     Attributes:
-        samples: the samples that it is trained on.
-        progress: share of the budget that is spent, in [0, 1].
+        samples: the data module that draws its samples.
+        progress: the share of the budget that has been spent, in [0, 1].
     """
 
-    samples: type[OverfitData] = OverfitData
+    samples: type[SurfaceData] = SurfaceData
     progress: Callable[[], float]
 
     def optimizer(self) -> Optimizer:
-        """The optimiser in the product's place."""
+        """The optimizer that replaces nsm's."""
         return build_optimizer(self.map, dict(self.hparams["optimizer"]))
 
     def configure_optimizers(self) -> Any:
         return scheduled(self.optimizer(), self.hparams)
 
 
-# Second order: Gauss–Newton steps, damped
+# Second order: damped Gauss–Newton steps
 
 
 class _Times(torch.autograd.Function):
-    """A X (rows, m) of a sparse matrix A, which can be differentiated as often as is wanted."""
+    """The product A X of a sparse matrix A (r, c) and X (c, m), differentiable at any order."""
 
     @staticmethod
     def forward(ctx: Any, matrix: csr_matrix, x: Tensor) -> Tensor:
@@ -63,7 +65,7 @@ class _Times(torch.autograd.Function):
 
 
 def _features(encoding: Any, uv: Tensor) -> Tensor:
-    """Value and both tangents of features (3, N, out_dim); a grid's tables are parameters."""
+    """Value and both tangents (3, N, out_dim) of features; the tables of a grid are parameters."""
     if not isinstance(encoding, SplineGrid):
         return value_and_jacobian_stack(encoding, uv).detach()
     parts = [torch.cat([uv[None], torch.eye(2).to(uv)[:, None].expand(-1, len(uv), -1)])]
@@ -77,15 +79,15 @@ def _features(encoding: Any, uv: Tensor) -> Tensor:
     return torch.cat(parts, dim=-1)
 
 
-def residuals(network: NeuralMap, batch: Samples, lambda_normal: float) -> Tensor:
-    """r (6 N,) with ‖r‖² the loss of Eq. 1 on a batch, differentiable twice by the parameters.
+def residuals(network: NeuralMap, batch: Samples, normal_weight: float) -> Tensor:
+    """Residuals r (6 N,) on a batch: ‖r‖² is the loss of Eq. 1, twice differentiable.
 
     Args:
-        network: φ of plain blocks.
+        network: φ, with plain blocks.
         batch: N samples.
-        lambda_normal: λ_n.
+        normal_weight: λ_n.
     """
-    # what is added to the values alone; slices would be filled up with zeros on the way back
+    # a bias is added to values only; slices would be padded with zeros in the backward pass
     first = torch.tensor([1.0, 0.0, 0.0]).to(batch.uv)[:, None, None]
 
     def linear(layer: nn.Linear, x: Tensor) -> Tensor:
@@ -95,7 +97,7 @@ def residuals(network: NeuralMap, batch: Samples, lambda_normal: float) -> Tenso
     act = network.activation
     for layer in network.layers[:-1]:
         value, by_u, by_v = linear(layer, stack).unbind()
-        value, slope = act.formulas.value_and_slope(value, **act.parameters_)
+        value, slope = act.value_and_slope(value)
         stack = torch.stack([value, by_u * slope, by_v * slope])
     stack = linear(network.output, stack)
     if network.linear_skip is not None:
@@ -103,53 +105,55 @@ def residuals(network: NeuralMap, batch: Samples, lambda_normal: float) -> Tenso
     value, by_u, by_v = stack.unbind()
     cross = torch.linalg.cross(by_u, by_v)
     turned = cross / (cross.square().sum(dim=1, keepdim=True) + NORMAL_FLOOR).sqrt()
-    parts = [value - batch.points, math.sqrt(lambda_normal) * (turned - batch.normals)]
+    parts = [value - batch.points, math.sqrt(normal_weight) * (turned - batch.normals)]
     return torch.cat([part.flatten() for part in parts]) / math.sqrt(len(batch.uv))
 
 
 class Products:
-    """J v and Jᵀ u, without J (M, P), of residuals r (M,) by P parameters.
+    """J v and Jᵀ u without the Jacobian J (M, P) of residuals r (M,) by P parameters.
 
-    Jᵀ u is a backward pass; J v one through that pass, which is linear in u.
+    Jᵀ u is a backward pass; J v is a backward pass through that one, which is linear in u.
 
     Args:
-        residual: (M,), with the graph that it came by, twice differentiable.
-        parameters: in the order in which vectors v hold theirs.
+        residual: (M,), with its graph, twice differentiable.
+        parameters: in the order of their entries in vectors v.
     """
 
     def __init__(self, residual: Tensor, parameters: Sequence[Tensor]) -> None:
         self.residual, self.parameters = residual, list(parameters)
         self.dual = torch.zeros_like(residual, requires_grad=True)
-        self.pulled = torch.autograd.grad(residual, self.parameters, self.dual, create_graph=True)
+        self.vjp_of_dual = torch.autograd.grad(
+            residual, self.parameters, self.dual, create_graph=True
+        )
 
-    def push(self, v: Tensor) -> Tensor:
+    def jvp(self, v: Tensor) -> Tensor:
         """J v (M,) of v (P,)."""
         parts = v.split([p.numel() for p in self.parameters])
         shaped = [part.view_as(p) for part, p in zip(parts, self.parameters, strict=True)]
-        return torch.autograd.grad(self.pulled, self.dual, shaped, retain_graph=True)[0]
+        return torch.autograd.grad(self.vjp_of_dual, self.dual, shaped, retain_graph=True)[0]
 
-    def pull(self, u: Tensor) -> Tensor:
+    def vjp(self, u: Tensor) -> Tensor:
         """Jᵀ u (P,) of u (M,)."""
-        pulled = torch.autograd.grad(self.residual, self.parameters, u, retain_graph=True)
-        return torch.cat([part.flatten() for part in pulled])
+        parts = torch.autograd.grad(self.residual, self.parameters, u, retain_graph=True)
+        return torch.cat([part.flatten() for part in parts])
 
 
 class LevenbergMarquardt(Optimizer):
-    """(JᵀJ + μ D) x = −Jᵀ r by conjugate gradients; a step is rate · x.
+    """Steps lr · x, where conjugate gradients solve (JᵀJ + μ D) x = −Jᵀ r.
 
-    D has for each tensor of parameters the mean of the diagonal of JᵀJ there, so that entries of
-    which the batch says little stay where they are. The diagonal, which the gradients are
-    preconditioned with, is estimated by E[(Jᵀu)²], u of random signs. μ follows the ratio of the
-    decrease that came to the one that the linear model promised, both on the step's batch; a step
-    that makes the loss larger there is taken back.
+    D is constant on each tensor of parameters, the mean of the diagonal of JᵀJ there, so that
+    entries that hardly affect the batch stay where they are. The diagonal is the preconditioner
+    too, and is estimated as E[(Jᵀu)²] with random signs u. μ follows the ratio of the actual
+    decrease to that predicted by the linear model, both on the batch of the step; a step that
+    increases the loss there is undone.
 
     Args:
-        parameters: as torch takes them.
-        residual: r of the parameters as they are, on the batch that the closure was of.
-        lr: share of a step that is made.
+        parameters: as torch's optimizers take them.
+        residual: computes r for the current parameters, on the batch of the last closure.
+        lr: factor of the step.
         iterations: of conjugate gradients.
-        damping: the first μ, and the least.
-        probes: vectors u a step.
+        damping: initial and least μ.
+        probes: number of vectors u in a step.
     """
 
     def __init__(
@@ -175,39 +179,39 @@ class LevenbergMarquardt(Optimizer):
         diagonal = torch.zeros(())
         for _ in range(self.probes):
             sign = torch.randint(0, 2, residual.shape).to(residual).mul_(2).sub_(1)
-            diagonal = diagonal + products.pull(sign).square() / self.probes
-        # weights before an output layer that is zero have no part in the loss yet
+            diagonal = diagonal + products.vjp(sign).square() / self.probes
+        # weights before an output layer that is still zero do not affect the loss yet
         diagonal = diagonal + 1e-6 * diagonal.mean()
         sizes = [p.numel() for p in group["params"]]
         means = [part.mean().expand(len(part)) for part in diagonal.split(sizes)]
         held = self.damping * torch.cat(means)
-        x, promised = self._solved(products, -products.pull(residual), diagonal, held)
+        x, predicted = self._solved(products, -products.vjp(residual), diagonal, held)
         before = float(residual.square().sum())
         with torch.no_grad():
             start = [p.clone() for p in group["params"]]
             parts = x.split([p.numel() for p in start])
             for p, part in zip(group["params"], parts, strict=True):
                 p.add_(part.view_as(p))
-            came = before - float(self.residual().square().sum())
+            decrease = before - float(self.residual().square().sum())
             for p, old in zip(group["params"], start, strict=True):
-                p.copy_(torch.lerp(old, p, group["lr"]) if came > 0 else old)
-        if came < 0.25 * promised:
+                p.copy_(torch.lerp(old, p, group["lr"]) if decrease > 0 else old)
+        if decrease < 0.25 * predicted:
             self.damping *= 4
-        elif came > 0.75 * promised:
+        elif decrease > 0.75 * predicted:
             self.damping = max(self.damping / 3, self.least)
         return value
 
     def _solved(
         self, products: Products, right: Tensor, diagonal: Tensor, held: Tensor
     ) -> tuple[Tensor, float]:
-        """x with (JᵀJ + held) x = right, and by how much the linear model of the loss is less
-        there."""
+        """x with (JᵀJ + held) x = right, and the decrease of the loss that the linear model
+        predicts."""
         scale = 1 / (diagonal + held)
         x, left = torch.zeros_like(right), right.clone()
         guess = scale * left
         direction, product = guess.clone(), left @ guess
         for _ in range(self.iterations):
-            image = products.pull(products.push(direction)) + held * direction
+            image = products.vjp(products.jvp(direction)) + held * direction
             length = product / (direction @ image)
             x += length * direction
             left -= length * image
@@ -218,7 +222,7 @@ class LevenbergMarquardt(Optimizer):
 
 
 class GaussNewton(Candidate):
-    """Steps of :class:`LevenbergMarquardt` on the loss of Eq. 1, by all parameters."""
+    """Steps of :class:`LevenbergMarquardt` on the loss of Eq. 1, for all parameters."""
 
     def __init__(
         self, iterations: int = 10, damping: float = 0.1, probes: int = 3, **task: Any
@@ -234,21 +238,21 @@ class GaussNewton(Candidate):
         lr = self.hparams["optimizer"]["lr"]
         return LevenbergMarquardt(
             self.map.parameters(),
-            lambda: residuals(self.map, self.batch, self.lambda_normal),
+            lambda: residuals(self.map, self.batch, self.loss_weights.normal),
             lr=lr,
             **self.inner,
         )
 
 
-# Optimisers of matrices, in Muon's place beside Adam
+# Optimizers of matrices that replace Muon beside Adam
 
 
 class Beside(MuonBesideAdam):
-    """Another optimiser in Muon's place, with Adam for all else.
+    """Another optimizer for the matrices, with Adam for all other parameters.
 
     Args:
-        muon: what it is like.
-        make: from the group of the matrices to the optimiser.
+        muon: the optimizer whose groups and Adam are used.
+        make: from the group of the matrices to their optimizer.
     """
 
     def __init__(
@@ -262,9 +266,9 @@ class Beside(MuonBesideAdam):
 
 
 class Preconditioned(Candidate):
-    """SOAP or Shampoo for the hidden layers' matrices; grids, biases and the output are Adam's.
+    """SOAP or Shampoo for the matrices of the hidden layers; Adam for grids, biases and the output.
 
-    A grid's table has a row for each of up to 264,196 points, too many for a preconditioner.
+    A table of a grid has up to 264,196 rows, too many for a preconditioner.
     """
 
     def __init__(self, kind: str = "soap", every: int = 10, **task: Any) -> None:
@@ -293,7 +297,7 @@ class Preconditioned(Candidate):
                 betas=muon.param_groups[1]["betas"],
                 start_preconditioning_step=self.every,
                 preconditioning_compute_steps=self.every,
-                graft_type=4,  # steps of RMSProp's length
+                graft_type=4,  # the step length of RMSProp
             )
 
         return Beside(muon, make)
@@ -313,13 +317,13 @@ class Weighted(NamedTuple):
 
 
 class ErrorSampler(SurfaceSampler):
-    """Draws points by area times 1 − share + share · e/ē, e a running error of each triangle, ē
-    its mean by area.
+    """Draws points with density 1 − share + share · e/ē by area, where e is a running error of each
+    triangle and ē its mean by area.
 
     Args:
         surface: the prepared surface.
         share: of the points that are drawn by error, in [0, 1).
-        decay: what a new error counts beside the old.
+        decay: weight of a new error; the previous one has 1 − decay.
     """
 
     def __init__(self, surface: Surface, share: float = 0.5, decay: float = 0.3) -> None:
@@ -329,33 +333,33 @@ class ErrorSampler(SurfaceSampler):
         self.error = torch.ones(len(self.faces), dtype=torch.float64)  # relative to the mean
 
     def weighted(self, count: int, generator: torch.Generator) -> Weighted:
-        """``count`` points, with the weights that make their mean one by area."""
+        """``count`` points, with the weights that make their mean the mean by area."""
         more = 1 - self.share + self.share * self.error / (self.area @ self.error)
         face, places = self._places(count, generator, (self.area * more).cumsum(0))
         return Weighted(*self._at(face, places), face, (1 / more[face]).float())
 
     def seen(self, face: Tensor, error: Tensor, weight: Tensor) -> None:
-        """Errors (N,) of samples, whose mean by area is that of error · weight."""
+        """Update the running errors by those of samples, (N,), with weights (N,)."""
         relative = (error / (error * weight).mean()).double()
         self.error[face] = torch.lerp(self.error[face], relative, self.decay)
 
 
 class ByError(Candidate):
-    """Half of the samples drawn by current error, the rest by area; no vertices among them.
+    """Half of the samples drawn by current error, the rest by area, without vertices.
 
     Args:
-        weighted: whether errors are weighted so that their mean is that by area.
+        weighted: weight the errors so that their mean is that by area.
     """
 
-    class samples(OverfitData):  # noqa: N801
+    class samples(SurfaceData):  # noqa: N801
         def setup(self, stage: str | None = None) -> None:
             super().setup(stage)
-            self.sampler = ErrorSampler(self.surface)
+            self.points = ErrorSampler(self.surface)
 
         def batch(self, step: int) -> Any:
-            assert isinstance(self.sampler, ErrorSampler)
-            generator = self.sampler.generator(self.seed, step)
-            return self.sampler.weighted(self.batch_size, generator)
+            assert isinstance(self.points, ErrorSampler)
+            generator = self.points.generator(self.seed, step)
+            return self.points.weighted(self.batch_size, generator)
 
     def __init__(self, weighted: bool = True, **task: Any) -> None:
         super().__init__(**task)
@@ -364,8 +368,8 @@ class ByError(Candidate):
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         value, jacobian = self.map.value_and_jacobian(batch.uv)
         squared = position(value, batch.points)
-        squared = squared + self.lambda_normal * normal(jacobian, batch.normals)
-        sampler = self.trainer.datamodule.sampler  # type: ignore[attr-defined]
+        squared = squared + self.loss_weights.normal * normal(jacobian, batch.normals)
+        sampler = self.trainer.datamodule.points  # type: ignore[attr-defined]
         sampler.seen(batch.face, squared.detach().sqrt(), batch.weight)
         return (squared * batch.weight if self.weighted else squared).mean()
 
@@ -374,7 +378,7 @@ class GrowingBatch(Candidate):
     """Batches that grow by a constant factor over the training.
 
     Args:
-        first, last: their sizes.
+        first, last: sizes of the first and the last batch.
     """
 
     def __init__(self, first: int = 256, last: int = 8192, **task: Any) -> None:
@@ -390,10 +394,10 @@ class GrowingBatch(Candidate):
 
 
 class CoarseToFine(Candidate):
-    """Levels of the grid released one after the other; those to come are zero and stay so.
+    """Levels of the grid are released one after the other; the others are zero and frozen.
 
     Args:
-        until: share of the training by which the last one is released; each takes an equal part.
+        until: share of the training after which the last level is released, at equal intervals.
     """
 
     def __init__(self, until: float = 0.4, **task: Any) -> None:
@@ -421,16 +425,16 @@ class HashGrid(nn.Module):
 
     Args:
         in_dim: 2.
-        levels: how many, their cells a side in geometric progression.
-        coarsest, finest: cells a side of the first and of the last.
+        levels: number of levels; their cells per side are in geometric progression.
+        coarsest, finest: cells per side of the first and the last level.
         features: of each level; ``out_dim`` is ``2 + levels * features``.
-        log2_rows: of the table of a level; one that needs more is hashed.
-        extent: half the side of the square that is covered; x outside is clamped to its rim.
+        log2_rows: of the table of a level; larger levels are hashed.
+        extent: half the side of the covered square; points outside are clamped to its boundary.
     """
 
     def __init__(
         self,
-        in_dim: int,
+        in_dim: int = 2,
         levels: int = 8,
         coarsest: int = 16,
         finest: int = 512,
@@ -444,12 +448,12 @@ class HashGrid(nn.Module):
         self.extent, self.features = extent, features
         rows = [min((cells + 1) ** 2, 2**log2_rows) for cells in self.cells]
         self.rows, self.offsets = rows, [sum(rows[:level]) for level in range(levels)]
-        # the tables of all levels, one below the other
+        # the tables of all levels, concatenated
         self.tables = nn.ParameterList([nn.Parameter(1e-2 * torch.randn(sum(rows), features))])
         self.out_dim = in_dim + levels * features
 
     def _places(self, corner: Tensor) -> Tensor:
-        """Rows (L, n) of the table that hold grid points (L, n, 2)."""
+        """Rows (L, n) of the table for grid points (L, n, 2)."""
         cells, rows, offsets = (
             torch.tensor(each)[:, None] for each in (self.cells, self.rows, self.offsets)
         )
@@ -482,8 +486,12 @@ class HashGrid(nn.Module):
 
 
 def register() -> None:
-    """Make the encoding known to settings."""
-    nsm.register_encoding("hash_grid", HashGrid)
+    """Make ``encoding=hash_grid`` an option: a user's own goes into a file of a conf folder."""
+    option = {
+        "defaults": [{"override /initialization@_global_.initialization": "random"}, "_self_"],
+        "_target_": f"{HashGrid.__module__}.HashGrid",
+    }
+    ConfigStore.instance().store(group="encoding", name="hash_grid", node=option)
 
 
 CANDIDATES: dict[str, type[Candidate]] = {
@@ -495,21 +503,21 @@ CANDIDATES: dict[str, type[Candidate]] = {
 }
 
 
-def parted(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A trial's words for nsm, and those for its candidate."""
-    own = [word for word in words if word.startswith(("candidate=", "candidate."))]
-    return [word for word in words if word not in own], own
+def parted(settings: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A trial's settings of nsm, and those of its candidate."""
+    own = [setting for setting in settings if setting.startswith(("candidate=", "candidate."))]
+    return [setting for setting in settings if setting not in own], own
 
 
-def exchanged(module: Overfit, words: Sequence[str], progress: Callable[[], float]) -> Overfit:
-    """The task as the words of a candidate have it; without any as it is."""
-    if not words:
+def exchanged(module: Overfit, settings: Sequence[str], progress: Callable[[], float]) -> Overfit:
+    """The candidate that the settings select, with the module's network; by default the module."""
+    if not settings:
         return module
-    name, *rest = words
-    settings = OmegaConf.to_container(
-        OmegaConf.from_dotlist([word.removeprefix("candidate.") for word in rest])
+    name, *rest = settings
+    own = OmegaConf.to_container(
+        OmegaConf.from_dotlist([setting.removeprefix("candidate.") for setting in rest])
     )
-    assert isinstance(settings, dict)
-    other = CANDIDATES[name.removeprefix("candidate=")](**module.hparams, **settings)
+    assert isinstance(own, dict)
+    other = CANDIDATES[name.removeprefix("candidate=")](**module.hparams, **own)
     other.map, other.progress = module.map, progress
     return other

@@ -1,8 +1,8 @@
-"""Fuzz what reads files, guided by coverage: ``make fuzz``.
+"""Fuzz the readers of files, guided by coverage: ``make fuzz``.
 
-Each target is given bytes, mutated from seeds and from the cases in tests/corpus, and may raise
-NsmError alone. What makes it raise anything else is left in the folder ``crashes``; once mended, it
-belongs into tests/corpus, whose files tests/test_corpus.py reads again.
+Each target reads bytes that are mutated from seeds and from the cases in tests/corpus, and may
+raise only NsmError. Input that raises anything else is stored in the folder ``crashes``; once the
+defect is fixed, the file belongs into tests/corpus, whose files tests/test_corpus.py reads again.
 
     python benchmarks/fuzz.py TARGET [SECONDS]
 """

@@ -1,10 +1,11 @@
-"""Maps between the shared meshes: quality and time, one JSON file for each case.
+"""Maps between classic meshes: quality and time, one JSON file for each case.
 
-Cases that are there already are left alone, so that an interrupted run goes on where it stopped:
+Existing files are kept, so that an interrupted run continues where it stopped:
 
     python benchmarks/maps.py --meshes FOLDER [--only CASE ...]
 
-Seconds are CPU time of a map from ready surfaces, figures and certificate included, on one thread.
+Seconds are the CPU time of a map on one thread, from trained surfaces, with its figures and
+certificate.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ import nsm
 
 RESULTS = Path(__file__).parent / "results" / "maps"
 ANIMALS = ("shrec07-381", "shrec07-384", "shrec07-388", "shrec07-393")
-# what changes from the default, one thing at a time, on one pair
+# one change from the default at a time, on one pair
 VARIANTS = {
     "default": [],
     "landmarks by a fixed weight": ["constraints.landmarks=fixed"],
     "landmarks and seam in full at once": ["constraints.ramp=0"],
-    "no term on triangles": ["constraints.lambda_triangles=0"],
-    "no term on the seam": ["constraints.lambda_seam=0"],
+    "no term on triangles": ["loss_weights.triangles=0"],
+    "no term on the seam": ["loss_weights.seam=0"],
     "boundary by a penalty": ["constraints.boundary=penalty"],
     "surfaces from a random start": [
         'phi.overrides=["initialization=random","encoding.resolutions=[16,64,256]"]'
@@ -53,17 +54,17 @@ def timed(make: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def pair(source: Any, target: Any, landmarks: Any, overrides: list[str]) -> dict[str, Any]:
-    """Figures of a map; raw meshes are made into neural surfaces before the clock starts."""
+    """Figures of a map; raw meshes become neural surfaces before the clock starts."""
 
-    def run(words: list[str]) -> Any:
-        return nsm.map_pair(source, target, landmarks, overrides=words, progress=False)
+    def run(settings: list[str]) -> Any:
+        return nsm.map_pair(source, target, landmarks, overrides=settings, progress=False)
 
     if isinstance(source, str):
         f = run([*overrides, "trainer.max_steps=1"])  # fills the cache
         source, target = f.source, f.target
         landmarks = f.landmarks.tolist() or None
     f, seconds = timed(lambda: run(overrides))
-    words = {
+    surfaces = {
         phi.surface.name: {
             "rms_percent": phi.metrics.get("rms_percent"),
             "median_symmetric_dirichlet": phi.surface.quality.get("median_symmetric_dirichlet"),
@@ -71,7 +72,7 @@ def pair(source: Any, target: Any, landmarks: Any, overrides: list[str]) -> dict
         }
         for phi in (f.source, f.target)
     }
-    return {"map_seconds": seconds, "metrics": f.metrics, "surfaces": words}
+    return {"map_seconds": seconds, "metrics": f.metrics, "surfaces": surfaces}
 
 
 def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
@@ -93,7 +94,7 @@ def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
         return {"map_seconds": seconds, "metrics": group.metrics}
 
     def ordered(i: int, j: int) -> dict[str, Any]:
-        # prepared together, as in the collection: the surfaces come from the cache
+        # prepared jointly, as in the collection: the surfaces come from the cache
         files = [animal(name) for name in ANIMALS]
         group = nsm.map_collection(
             files, points(*ANIMALS), overrides=["trainer.max_steps=1"], progress=False
@@ -111,10 +112,10 @@ def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
     result["igea-sphere_cap"] = lambda: pair(str(meshes / "igea.ply"), "sphere_cap", None, [])
     study = (animal("shrec07-384"), animal("shrec07-388"), points("shrec07-384", "shrec07-388"))
     for group, variants in (("setting", VARIANTS), ("seam", SEAMS)):
-        for name, words in variants.items():
-            if words or group == "setting":
+        for name, settings in variants.items():
+            if settings or group == "setting":
                 key = f"{group}: {name}"
-                result[key] = lambda words=words: pair(*study, words)  # type: ignore[misc]
+                result[key] = lambda settings=settings: pair(*study, settings)  # type: ignore[misc]
     for name in ("shrec07-384.off", "cow.obj"):
         for kind in ("free", "fixed"):
             file = str(meshes / name)
@@ -127,8 +128,8 @@ def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
 def flattened(file: str, boundary: str) -> dict[str, Any]:
     """Figures of flattening, with those of libigl's methods on the same cut mesh."""
     phi = nsm.overfit(nsm.Surface.load(file), progress=False)
-    words = [f"constraints.boundary={boundary}"]
-    flat, seconds = timed(lambda: nsm.parameterize(phi, overrides=words, progress=False))
+    settings = [f"constraints.boundary={boundary}"]
+    flat, seconds = timed(lambda: nsm.parameterize(phi, overrides=settings, progress=False))
     return {"map_seconds": seconds, "flattening": flat.metrics}
 
 
@@ -153,31 +154,31 @@ FLAT = {
 def tables() -> str:
     """All results as Markdown; the distortion is symmetric Dirichlet, 4 at best."""
     files = sorted(RESULTS.glob("*.json"))
-    results = {words["case"]: words for words in (json.loads(f.read_text()) for f in files)}
+    results = {found["case"]: found for found in (json.loads(f.read_text()) for f in files)}
     maps, changes, flat = [], [], []
-    for name, words in results.items():
-        row = [f"{words['map_seconds']:.0f}"]
+    for name, found in results.items():
+        row = [f"{found['map_seconds']:.0f}"]
         if name.startswith("param: "):
-            flat += _flat_rows(name.removeprefix("param: "), words["flattening"])
+            flat += _flat_rows(name.removeprefix("param: "), found["flattening"])
         elif name.startswith(("setting: ", "seam: ")):
-            changes.append([name, *_values(words["metrics"], COLUMNS), *row])
-        elif "pairs" not in words["metrics"]:
-            maps.append([name.replace("-", " → "), *_values(words["metrics"], COLUMNS), *row])
+            changes.append([name, *_values(found["metrics"], COLUMNS), *row])
+        elif "pairs" not in found["metrics"]:
+            maps.append([name.replace("-", " → "), *_values(found["metrics"], COLUMNS), *row])
     parts = [_table(["map", *COLUMNS.values(), "seconds"], maps)]
     if "collection" in results:
-        words = results["collection"]
+        found = results["collection"]
         rows = [
             [pair.replace("shrec07-", ""), *_values(metrics, COLUMNS)]
-            for pair, metrics in words["metrics"]["pairs"].items()
+            for pair, metrics in found["metrics"]["pairs"].items()
         ]
-        mean, most = (words["metrics"][f"cycle_error_{k}_percent"] for k in ("mean", "max"))
+        mean, most = (found["metrics"][f"cycle_error_{k}_percent"] for k in ("mean", "max"))
         parts.append(
             "The collection of the four animals, all ordered pairs by one training of "
-            f"{words['map_seconds']:.0f} s; cycle error\n{mean:.3f} % of the diagonal in the mean, "
+            f"{found['map_seconds']:.0f} s; cycle error\n{mean:.3f} % of the diagonal in the mean, "
             f"{most:.2f} % at most:"
         )
         parts.append(_table(["pair", *COLUMNS.values()], rows))
-    parts.append("One thing changed at a time, on 384 → 388 (cut as a pair):")
+    parts.append("One setting changed at a time, on 384 → 388 (cut as a pair):")
     parts.append(_table(["change", *COLUMNS.values(), "seconds"], changes))
     parts.append("Flattening, beside libigl's methods on the same cut mesh:")
     parts.append(_table(["surface", "method", *FLAT.values()], flat))
@@ -214,13 +215,13 @@ def main() -> None:
         if file.exists() or (arguments.only and name not in arguments.only):
             continue
         print(name, flush=True)
-        words = {
+        found = {
             "case": name,
             "torch": torch.__version__,
             "machine": platform.machine(),
             **run(),
         }
-        file.write_text(json.dumps(words, indent=2) + "\n")
+        file.write_text(json.dumps(found, indent=2) + "\n")
     text = tables()
     (RESULTS.parent / "maps.md").write_text(text)
     print(text)

@@ -1,10 +1,10 @@
-"""Error against time when a network is overfitted to a surface: default beside paper settings.
+"""Error against time of overfitting a network to a surface: default settings and the paper's.
 
-Time is CPU time of a process that trains on one thread, so that figures from a busy machine can
-be compared. The default is trained once for each budget, its start by least squares included, with
-a schedule that ends with the budget; the published schedule knows no end, so that one run is looked
-at in passing. Errors are those of METHOD's "How quality is measured", on points
-that no training sees. Runs that are already in the result file are not repeated.
+Time is the CPU time of a process that trains on one thread, so that figures from a busy machine are
+comparable. The default is trained once for each budget, including its initialization by least
+squares, with a schedule that ends with the budget. The published schedule has no end, so that one
+run is measured at several times. Errors are those of :func:`nsm.results.overfit_metrics`, on points
+that no training sees. Runs in the result file are not repeated.
 
     python benchmarks/overfit.py --meshes FOLDER
 """
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from nsm.domains import Surface
 from rich.console import Console
 from training import MESHES, Clock, OnTheClock, surface_of, train
 
@@ -54,11 +55,13 @@ def _paper(surface: Surface, minutes: list[float]) -> dict[float, dict[str, Any]
         module.map.train()
 
     settings = config.trainer
-    watch = GradientWatch(config.logger.every, settings.stop_gradient_norm, settings.stop_window)
+    watch = GradientWatch(
+        config.trainer.log_every, settings.stop_gradient_norm, settings.stop_window
+    )
     trainer, module, seconds = train(
         config, surface, [Clock([60 * m for m in minutes], at_mark), watch]
     )
-    for m in minutes:  # the stopping rule came first: this is what the user has at that time
+    for m in minutes:  # the stopping rule ended the training before that time
         found.setdefault(
             m,
             {
@@ -72,7 +75,7 @@ def _paper(surface: Surface, minutes: list[float]) -> dict[float, dict[str, Any]
 
 
 def _store(entry: str, value: dict[str, Any], output: Path) -> None:
-    # read again each time: two processes may fill one file side by side
+    # read again each time: two processes may write to one file
     results = json.loads(output.read_text()) if output.exists() else {"runs": {}}
     results["machine"] = {"processor": platform.machine(), "torch": torch.__version__}
     results["runs"][entry] = value

@@ -1,7 +1,7 @@
-"""The published recipe of one training step, restated from METHOD for comparison of cost.
+"""The published recipe of one training step, restated to compare its cost.
 
-Jacobians come from one ``autograd.grad`` per output with a graph of its own, tangent frames from a
-batched SVD, and distortions from explicit inverses. Figures of it are of cost alone.
+Jacobians come from one ``autograd.grad`` with a separate graph per output, tangent frames from a
+batched SVD, and distortions from explicit inverses.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ EPSILON = 0.01
 
 
 def jacobian(y: Tensor, x: Tensor) -> Tensor:
-    """(N, n, 2) of outputs y (N, n) by points x (N, 2)."""
+    """The Jacobians (N, n, 2) of outputs y (N, n) with respect to points x (N, 2)."""
     rows = [torch.autograd.grad(y[:, i].sum(), x, create_graph=True)[0] for i in range(y.shape[1])]
     return torch.stack(rows, dim=1)
 
@@ -31,7 +31,7 @@ def overfit(phi: nn.Module, uv: Tensor, points: Tensor, normals: Tensor) -> Tens
 
 
 def _flattened(j: Tensor) -> Tensor:
-    """J_φ (N, 3, 2) on its tangent plane, (N, 2, 2)."""
+    """J_φ (N, 3, 2) in an orthonormal frame of the tangent plane, (N, 2, 2)."""
     frame, _, _ = torch.linalg.svd(j.detach(), full_matrices=False)
     return frame.transpose(1, 2) @ j
 
@@ -48,8 +48,8 @@ def _injectivity(j: Tensor) -> Tensor:
     return 100 * (-det.sign() * torch.exp(-det)).clamp(min=0).mean()
 
 
-def _boundary(h: nn.Module, rim: Tensor) -> Tensor:
-    return 1e6 * ((h(rim).norm(dim=1) - 1) ** 2).mean()
+def _boundary(h: nn.Module, boundary_points: Tensor) -> Tensor:
+    return 1e6 * ((h(boundary_points).norm(dim=1) - 1) ** 2).mean()
 
 
 def param(phi: nn.Module, h: nn.Module, uv: Tensor) -> Tensor:
@@ -60,25 +60,27 @@ def param(phi: nn.Module, h: nn.Module, uv: Tensor) -> Tensor:
     return _dirichlet(j).mean() + _injectivity(planar)
 
 
-def pair_map(phi: nn.Module, psi: nn.Module, h: nn.Module, uv: Tensor, rim: Tensor) -> Tensor:
-    """That of the map f∘φ = ψ∘h, with B and G."""
+def pair_map(
+    phi: nn.Module, psi: nn.Module, h: nn.Module, uv: Tensor, boundary_points: Tensor
+) -> Tensor:
+    """Symmetric Dirichlet energy of the map f∘φ = ψ∘h, with B and G."""
     x = uv.clone().requires_grad_()
     image = h(x)
     source, planar = jacobian(phi(x), x), jacobian(image, x)
     target = jacobian(psi(image), x)
     j = target @ torch.linalg.inv(_flattened(source))
-    return _dirichlet(j).mean() + _injectivity(planar) + _boundary(h, rim)
+    return _dirichlet(j).mean() + _injectivity(planar) + _boundary(h, boundary_points)
 
 
 def collection_map(
-    phis: Sequence[nn.Module], maps: Sequence[nn.Module], uv: Tensor, rim: Tensor
+    phis: Sequence[nn.Module], maps: Sequence[nn.Module], uv: Tensor, boundary_points: Tensor
 ) -> Tensor:
-    """The mean of that over all ordered pairs, with B and G of every map."""
+    """The mean of that energy over all ordered pairs, with B and G of every map."""
     x = uv.clone().requires_grad_()
     total, curves = uv.new_zeros(()), []
     for phi, h in zip(phis, maps, strict=True):
         image = h(x)
-        total = total + _injectivity(jacobian(image, x)) + _boundary(h, rim)
+        total = total + _injectivity(jacobian(image, x)) + _boundary(h, boundary_points)
         curves.append(jacobian(phi(image), x))
     pairs = [(i, j) for i in range(len(phis)) for j in range(len(phis)) if i != j]
     for i, j in pairs:

@@ -1,9 +1,8 @@
-"""Seams optimised together with the map: drawn anew along it, in turns.
+"""Seams optimized together with the map: after each map, both shapes are cut anew.
 
-A map takes the source's seam to the target's, wherever these happen to lie. Here, once there is a
-map, a tree of paths is sought on the source that is short on both shapes by the map, and led
-along its image on the target; both are cut along these, and mapped again. What the first seam
-held in place is then free to move.
+A map takes the source's seam to the target's, wherever these happen to lie. Here a map is used to
+find a tree of paths on the source that is short on both shapes, and the corresponding paths on the
+target; both shapes are cut along these and mapped again. What the first seam fixed can then move.
 
     python benchmarks/redrawn_seam.py --meshes FOLDER [--pair 384 388] [--rounds 2]
 """
@@ -17,9 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
-
-import nsm
 from nsm.domains import Disc, Keys
 from nsm.domains.common_seams import (
     aligned_keys,
@@ -28,6 +24,9 @@ from nsm.domains.common_seams import (
     edge_lengths,
 )
 from nsm.domains.joint_preparation import common_fractions
+from scipy.spatial import cKDTree
+
+import nsm
 from nsm.results import by_file_vertex
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths
@@ -36,7 +35,7 @@ from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import CleanMesh, clean
 
 RESULTS = Path(__file__).parent / "results" / "redrawn_seam"
-_ASTRAY = 0.01  # of the diagonal: how far from its line a path may go before it gets dear
+_ASTRAY = 0.01  # of the diagonal: distance from its line at which a path costs twice as much
 _FIGURES = (
     "symmetric_dirichlet_median",
     "symmetric_dirichlet_mean",
@@ -48,7 +47,7 @@ _FIGURES = (
 
 
 def along(mesh: CleanMesh, line: np.ndarray) -> np.ndarray:
-    """(E,) costs of edges that keep a path to a line of points (N, 3)."""
+    """(E,) costs of edges that make a path follow a line of points (N, 3)."""
     pairs = topology.edges_of(mesh.faces).pairs
     middle = mesh.vertices[pairs].mean(axis=1)
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
@@ -57,7 +56,7 @@ def along(mesh: CleanMesh, line: np.ndarray) -> np.ndarray:
 
 
 def line_through(points: np.ndarray, paths: list[list[int]]) -> np.ndarray:
-    """Points close to each other along paths of vertices."""
+    """Densely spaced points along paths of vertices."""
     share = np.linspace(0, 1, 9)[:, None, None]
     parts = []
     for path in paths:
@@ -69,13 +68,13 @@ def line_through(points: np.ndarray, paths: list[list[int]]) -> np.ndarray:
 def redrawn(
     meshes: list[CleanMesh], names: list[str], ids: list[np.ndarray], image: np.ndarray
 ) -> list[nsm.Surface]:
-    """Both meshes cut along seams that lie on one another by a map.
+    """Both meshes, cut along seams that correspond under a map.
 
     Args:
         meshes: source and target.
-        names: theirs.
-        ids: landmarks (L,) on the seam, of each.
-        image: (V, 3) of the source's vertices on the target.
+        names: of the meshes.
+        ids: landmarks (L,) on the seam, of each mesh.
+        image: (V, 3), the images of the source's vertices on the target.
     """
     source, target = meshes
     pairs = topology.edges_of(source.faces).pairs
@@ -96,8 +95,8 @@ def redrawn(
         [boundary_keys(cut.origin, cut.loop, v) for cut, v in zip(cuts, ids, strict=True)]
     )
     assert keys is not None
-    on_rim = [k[:, 1] for k in keys]
-    fractions = common_fractions(cuts, on_rim, Disc())
+    on_boundary = [k[:, 1] for k in keys]
+    fractions = common_fractions(cuts, on_boundary, Disc())
     return [
         nsm.Surface.from_cut(
             cut,
@@ -107,12 +106,12 @@ def redrawn(
             parameterization="slim",
             keys=Keys(key, fractions),
         )
-        for cut, mesh, name, key in zip(cuts, meshes, names, on_rim, strict=True)
+        for cut, mesh, name, key in zip(cuts, meshes, names, on_boundary, strict=True)
     ]
 
 
 def study(meshes: Path, pair: list[str], rounds: int) -> list[dict[str, Any]]:
-    """Figures of the map with the seams that ``seam.path=auto`` finds, and after each round."""
+    """Figures of the map with the seams of ``seam.path=auto``, and after each round."""
     names = [f"shrec07-{name}" for name in pair]
     files = [str(meshes / f"{name}.off") for name in names]
     marks = [str(meshes / "landmarks" / f"{name}.vts") for name in names]
@@ -120,8 +119,8 @@ def study(meshes: Path, pair: list[str], rounds: int) -> list[dict[str, Any]]:
     landmarks = np.stack([read_landmarks(file) for file in marks], axis=1)
     f = nsm.map_pair(*files, marks, progress=False)
     found = [{key: f.metrics[key] for key in _FIGURES}]
-    rim = f.source.surface.source_vertex[topology.boundary_loops(f.source.surface.faces)[0]]
-    on_seam = np.isin(landmarks[:, 0], rim)
+    boundary = topology.boundary_loops(f.source.surface.faces)[0]
+    on_seam = np.isin(landmarks[:, 0], f.source.surface.source_vertex[boundary])
     for _ in range(rounds):
         image = by_file_vertex(f.source.surface, f.target.in_original_units(f.image))
         ids = [cleaned[k].merged[landmarks[on_seam, k]] for k in (0, 1)]
@@ -142,14 +141,14 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.meshes.is_dir():
         parser.error(f"{arguments.meshes}: no such folder; give one with --meshes")
-    words = {
+    found = {
         "pair": arguments.pair,
         "torch": torch.__version__,
         "rounds": study(arguments.meshes, arguments.pair, arguments.rounds),
     }
     RESULTS.mkdir(parents=True, exist_ok=True)
     file = RESULTS / f"{'-'.join(arguments.pair)}.json"
-    file.write_text(json.dumps(words, indent=2) + "\n")
+    file.write_text(json.dumps(found, indent=2) + "\n")
     print(file.read_text())
 
 

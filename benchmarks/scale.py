@@ -1,7 +1,7 @@
 """Large meshes and large collections: CPU time and peak memory of each stage of a whole run.
 
-Each case is a process of its own, from raw meshes to the files in the run folder, with one thread.
-Trainings are short: their steps cost the same on every mesh, and speed.py measures those.
+Each case is a separate process, from raw meshes to the files in the run folder, with one thread.
+Trainings are short: their steps cost the same on every mesh, and speed.py measures them.
 
     python benchmarks/scale.py [--cases NAME ...] [--pictures FOLDER]
 """
@@ -33,7 +33,7 @@ LANDMARKS = [0, 400, 900, 1500]
 
 
 def bumps(points: np.ndarray, seed: int, waves: int, finest: float) -> np.ndarray:
-    """A sum of waves (N,) in all directions, from long to ``finest`` radians a unit of length."""
+    """A sum of waves (N,) in all directions, up to ``finest`` radians per unit of length."""
     random, height = np.random.default_rng(seed), np.zeros(len(points))
     for k in range(waves):
         way = random.normal(size=3)
@@ -58,7 +58,7 @@ def open_mesh() -> shapes.Mesh:
 
 
 def bowl(seed: int) -> shapes.Mesh:
-    """One of many bowls with bumps: 5,400 faces, vertices with the same numbers correspond."""
+    """One of many bowls with bumps: 5,400 faces; equal vertex numbers correspond."""
     vertices, faces = shapes.hemisphere(30)
     return vertices * (1 + 0.8 * bumps(vertices, 100 + seed, 12, 4.0))[:, None], faces
 
@@ -72,25 +72,30 @@ def write_obj(path: Path, mesh: shapes.Mesh) -> str:
 
 
 class Stages:
-    """CPU seconds of functions of the pipeline, and the process's peak memory at their ends."""
+    """CPU seconds of functions of the pipeline, and the peak memory of the process after them."""
 
     def __init__(self) -> None:
         self.taken: dict[str, dict[str, float]] = {}
+        self.within = False
 
-    def around(self, module: Any, name: str, stage: str) -> None:
-        """Have ``module.name`` count for a stage, each time that it is called."""
-        inner: Callable[..., Any] = getattr(module, name)
+    def around(self, owner: Any, name: str, stage: str) -> None:
+        """Count each call of ``owner.name``, a function or method, for a stage, unless it is part
+        of another stage."""
+        inner: Callable[..., Any] = getattr(owner, name)
 
         def measured(*args: Any, **kwargs: Any) -> Any:
-            start = time.process_time()
+            if self.within:
+                return inner(*args, **kwargs)
+            start, self.within = time.process_time(), True
             try:
                 return inner(*args, **kwargs)
             finally:
+                self.within = False
                 entry = self.taken.setdefault(stage, {"cpu_seconds": 0.0, "peak_mib": 0.0})
                 entry["cpu_seconds"] += time.process_time() - start
                 entry["peak_mib"] = peak_mib()
 
-        setattr(module, name, measured)
+        setattr(owner, name, measured)
 
 
 def peak_mib() -> float:
@@ -99,46 +104,52 @@ def peak_mib() -> float:
 
 def overfit(mesh: Callable[[], shapes.Mesh], folder: Path) -> dict[str, Any]:
     """task=overfit from a raw mesh."""
-    from nsm.pipeline import overfit as pipeline
+    from nsm.pipeline import runner
+    from nsm.pipeline.overfit import OverfitTask
 
     stages = Stages()
-    for name, stage in (
-        ("configured_surface", "preparation"),
-        ("train", f"training, {STEPS} steps"),
-        ("overfit_metrics", "figures"),
-        ("save_surface", "saving"),
-        ("_write_artefacts", "meshes and pictures"),
+    for owner, name, stage in (
+        (OverfitTask, "prepare", "preparation"),
+        (runner, "trained", f"training, {STEPS} steps"),
+        (OverfitTask, "measure", "figures"),
+        (OverfitTask, "save", "saving"),
+        (OverfitTask, "write_artefacts", "meshes and pictures"),
     ):
-        stages.around(pipeline, name, stage)
+        stages.around(owner, name, stage)
     file = write_obj(folder / "mesh.obj", mesh())
-    words = ["task=overfit", f"surface.path={file}", f"trainer.max_steps={STEPS}"]
-    found = whole_run(words, folder / "run", stages)
+    settings = ["task=overfit", f"surface.path={file}", f"trainer.max_steps={STEPS}"]
+    found = whole_run(settings, folder / "run", stages)
     return {**found, "preparation": metrics(folder)["preparation"]}
 
 
 def collection(folder: Path) -> dict[str, Any]:
     """task=collection_map of many surfaces, all ordered pairs of them."""
-    from nsm.pipeline import collection_map as pipeline
-    from nsm.pipeline import resolve_inputs as inputs
+    from nsm.pipeline import resolve_inputs, runner
+    from nsm.pipeline.collection_map import CollectionMapTask
 
     stages = Stages()
-    for module, name, stage in (
-        (inputs, "prepare_jointly", "preparation"),
-        (inputs, "made_batched", f"neural surfaces, {PHI_STEPS} steps"),
-        (pipeline, "fitted", f"training, {COLLECTION_STEPS} steps"),
-        (pipeline, "certified", "certificates"),
-        (pipeline, "collection_metrics", "figures"),
-        (pipeline, "_write_artefacts", "meshes and pictures"),
+    for owner, name, stage in (
+        (resolve_inputs, "prepare_jointly", "preparation"),
+        (resolve_inputs, "cached_surfaces", f"neural surfaces, {PHI_STEPS} steps"),
+        (runner, "trained", f"training, {COLLECTION_STEPS} steps"),
+        (runner, "certified", "certificates"),
+        (CollectionMapTask, "measure", "figures"),
+        (CollectionMapTask, "write_artefacts", "meshes and pictures"),
     ):
-        stages.around(module, name, stage)
+        stages.around(owner, name, stage)
     files = [write_obj(folder / f"bowl{k}.obj", bowl(k)) for k in range(SURFACES)]
     landmarks = folder / "landmarks.json"
     landmarks.write_text(json.dumps([LANDMARKS] * SURFACES))
-    words = ["task=collection_map", f"trainer.max_steps={COLLECTION_STEPS}"]
-    # so short a training leaves flips, and to mend them would take longer than all the rest
-    words += [f"landmarks={landmarks}", "certification.repair=false"]
-    words += [f"surfaces=[{','.join(files)}]", f'phi.overrides=["trainer.max_steps={PHI_STEPS}"]']
-    found = whole_run(words, folder / "run", stages)
+    settings = [
+        "task=collection_map",
+        f"trainer.max_steps={COLLECTION_STEPS}",
+        f"surfaces=[{','.join(files)}]",
+        f"landmarks={landmarks}",
+        f'phi.overrides=["trainer.max_steps={PHI_STEPS}"]',
+        # so short a training leaves flips, and their repair would take longer than all the rest
+        "certification.repair=false",
+    ]
+    found = whole_run(settings, folder / "run", stages)
     pairs = metrics(folder)["metrics"]["pairs"].values()
     medians = [pair["symmetric_dirichlet_median"] for pair in pairs]
     return {
@@ -150,16 +161,16 @@ def collection(folder: Path) -> dict[str, Any]:
 
 
 def metrics(folder: Path) -> dict[str, Any]:
-    words: dict[str, Any] = json.loads((folder / "run" / "metrics.json").read_text())
-    return words
+    found: dict[str, Any] = json.loads((folder / "run" / "metrics.json").read_text())
+    return found
 
 
-def whole_run(words: list[str], folder: Path, stages: Stages) -> dict[str, Any]:
+def whole_run(settings: list[str], folder: Path, stages: Stages) -> dict[str, Any]:
     from nsm.config import compose_config
     from nsm.pipeline import run
 
     start = time.process_time()
-    run(compose_config([*words, "seed=0", "trainer.progress=false"]), folder)
+    run(compose_config([*settings, "seed=0", "trainer.progress=false"]), folder)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return {
         "stages": stages.taken,
@@ -178,14 +189,15 @@ CASES: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {
 
 
 def section(results: dict[str, Any]) -> list[str]:
-    """The results as a part of docs/performance.md."""
+    """The results as a section of docs/performance.md."""
     lines = [
         "",
         "## Large meshes and collections",
         "",
-        f"Made by `make bench-scale` on {results['machine']}, one thread: from raw meshes to the "
-        "files in the run folder, with short trainings. CPU time, and the process's peak memory "
-        f"at the end of each stage; the limit is {LIMIT_GIB * 1024} MiB.",
+        f"`make bench-scale` measures these on {results['machine']}, with one thread: from raw "
+        "meshes to the files in the run folder, with short trainings. The table has CPU time, and "
+        "the peak memory of the process at the end of each stage; the limit is "
+        f"{LIMIT_GIB * 1024} MiB.",
         "",
         "| what | stage | CPU seconds | peak MiB |",
         "|---|---|---|---|",
@@ -198,7 +210,7 @@ def section(results: dict[str, Any]) -> list[str]:
                 f"{taken['peak_mib']:.0f} |"
             )
         lines.append(
-            f"| | **in all** | **{found['cpu_seconds']:.0f}** | **{found['peak_mib']:.0f}** |"
+            f"| | **total** | **{found['cpu_seconds']:.0f}** | **{found['peak_mib']:.0f}** |"
         )
     lines.append("")
     for name, found in cases.items():
@@ -209,21 +221,21 @@ def section(results: dict[str, Any]) -> list[str]:
         if "pairs" in found:
             text += (
                 f", {found['certified_pairs']} of {found['pairs']} ordered pairs certified "
-                "with nothing repaired, after so short a training; "
-                f"symmetric Dirichlet {found['symmetric_dirichlet_median']:.2f} in the median."
+                "without repair, after so short a training; median symmetric Dirichlet "
+                f"{found['symmetric_dirichlet_median']:.2f}."
             )
         else:
             quality = found["preparation"]
             text += (
-                f", {quality['flipped_triangles']:.0f} flipped triangles, symmetric Dirichlet of "
-                f"the domain {quality['median_symmetric_dirichlet']:.2f} in the median."
+                f", {quality['flipped_triangles']:.0f} flipped triangles, median symmetric "
+                f"Dirichlet of the domain {quality['median_symmetric_dirichlet']:.2f}."
             )
         lines += [text, ""]
     return lines[:-1]
 
 
 def run_case(name: str, pictures: Path | None) -> dict[str, Any]:
-    """A case in a process of its own, with empty caches."""
+    """Run a case in a separate process, with empty caches."""
     with tempfile.TemporaryDirectory() as place:
         output = Path(place) / "found.json"
         command = [sys.executable, __file__, "--inside", name, "--folder", place]
@@ -244,7 +256,7 @@ def run_case(name: str, pictures: Path | None) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES)
-    parser.add_argument("--pictures", type=Path, help="where to keep the runs' pictures")
+    parser.add_argument("--pictures", type=Path, help="folder for the runs' pictures")
     parser.add_argument("--inside", choices=CASES, help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -252,7 +264,7 @@ def main() -> None:
         found = CASES[arguments.inside][1](arguments.folder)
         (arguments.folder / "found.json").write_text(json.dumps(found))
         return
-    for name in arguments.cases:  # kept one by one: a long run that is stopped has its parts
+    for name in arguments.cases:  # stored one by one: an interrupted run keeps what it has
         found = run_case(name, arguments.pictures)
         results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"cases": {}}
         results["machine"] = f"{os.cpu_count()} CPU cores, {platform.machine()}"

@@ -1,8 +1,8 @@
-"""What a training step costs, and how soon a training is where it should be.
+"""The cost of a training step, and the time of a training to a given error.
 
-Sides that are compared run in turn, round by round, and medians are taken. On a CPU, time is CPU
-time of the process (its threads together), so that other programs disturb little; on a GPU it is
-the clock, synchronised. The GPU is used where there is one.
+Variants that are compared run in turn, round by round; results are medians. On a CPU, time is the
+CPU time of the process (all its threads), which other programs disturb little; on a GPU it is
+wall-clock time, synchronized. The GPU is used where there is one.
 
     python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N] [--meshes FOLDER]
 """
@@ -23,21 +23,18 @@ import numpy as np
 import published
 import scale
 import torch
-from omegaconf import DictConfig, OmegaConf
+from nsm.domains import Surface
+from nsm.domains.surface import as_it_lies
+from omegaconf import DictConfig
 from torch import Tensor, nn
+from training import module_of, samples_of
 
 import nsm
 from nsm.config import compose_config
-from nsm.data import OverfitData, Samples
-from nsm.domains import Surface
-from nsm.domains.joint_preparation import matched_landmarks
-from nsm.domains.surface import as_it_lies
+from nsm.data import Samples, SurfaceData
 from nsm.energies.overfit import normal, position
-from nsm.maps import NeuralMap, build_map, together
-from nsm.pipeline import build_overfit
-from nsm.pipeline.collection_map import build_collection_map
-from nsm.pipeline.pair_map import build_pair_map
-from nsm.pipeline.param import build_param
+from nsm.maps import NeuralMap, batched
+from nsm.maps.encodings import Identity
 from nsm.results import NeuralSurface, atomic_write
 from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks.compiling import Compiled
@@ -48,10 +45,10 @@ PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 TASKS = ("overfit", "param", "pair_map", "collection_map")
 SETTINGS = ("paper", "default")
 ERRORS = (1.0, 0.5, 0.2, 0.1)  # RMS in percent of the diagonal
-SHARES = (0.5, 0.8, 0.9, 0.95)  # of the way from the domain's distortion to the least one found
+SHARES = (0.5, 0.8, 0.9, 0.95)  # of the decrease from the domain's distortion to the least found
 SURFACES = 3
-TOGETHER = (2, 4, 16)  # surfaces in one batch
-LENGTHS = (500, 1000, 2000, 4000, 8000)  # steps of a training that shall reach GOAL
+BATCHED = (2, 4, 16)  # surfaces in one batch
+LENGTHS = (500, 1000, 2000, 4000, 8000)  # steps of the trainings that try to reach GOAL
 GOAL = 0.1  # RMS in percent of the diagonal
 NEVER = 10**12  # steps
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -67,7 +64,7 @@ def clock() -> float:
 
 
 def in_turn(sides: dict[str, Step], rounds: int) -> dict[str, float]:
-    """Median seconds of each side; they take turns, after one round that does not count."""
+    """Median seconds of each variant; they take turns, after one round that does not count."""
     taken: dict[str, list[float]] = {name: [] for name in sides}
     for _ in range(rounds + 1):
         for name, step in sides.items():
@@ -86,24 +83,24 @@ def dome(rings: int = 30, height: float = 0.5) -> Surface:
 
 def config_of(task: str, settings: str) -> DictConfig:
     """The task's configuration; the paper's for maps is that of its pair maps."""
-    words = [f"task={task}", "seed=0"]
+    overrides = [f"task={task}", "seed=0"]
     if settings == "paper":
-        words += ["experiment=paper" if task == "overfit" else "experiment=paper_pair"]
+        overrides += ["experiment=paper" if task == "overfit" else "experiment=paper_pair"]
         if task == "param":
-            words += ["constraints=param", "constraints.lambda_triangles=0"]
-    return compose_config(words)
+            overrides += ["constraints=param", "loss_weights.triangles=0"]
+    return compose_config(overrides)
 
 
 def frozen_surface(settings: str, surface: Surface) -> NeuralSurface:
-    """A network of the settings that is taken for the surface: untrained, which costs as much."""
-    module = build_overfit(config_of("overfit", settings), surface)
+    """An untrained network in place of the neural surface: it costs as much."""
+    module = module_of(config_of("overfit", settings), surface)
     return NeuralSurface(surface, module.map.eval().requires_grad_(False).to(DEVICE))
 
 
 def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]:
-    """Loss and gradient of one step, ours and the published recipe's, of the same networks."""
+    """Loss and gradient of one step of the same networks: ours, and the published recipe's."""
     config, surface = config_of(task, settings), dome()
-    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+    data = samples_of(config, surface)
     data.trainer = None
     data.setup()
     batch = Samples(*(part.to(DEVICE) for part in data.batch(0)))
@@ -111,31 +108,31 @@ def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]
     none = [np.zeros(0, dtype=np.int64)] * k
     module: Any
     if task == "overfit":
-        module = build_overfit(config, surface).to(DEVICE)
+        module = module_of(config, surface).to(DEVICE)
 
         def theirs() -> Tensor:
             return published.overfit(module.map, *batch)
 
     elif task == "param":
-        module = build_param(config, phis[0]).to(DEVICE)
+        module = module_of(config, phis[0]).to(DEVICE)
 
         def theirs() -> Tensor:
             return published.param(phis[0].map, module.map, batch.uv)
 
     elif task == "pair_map":
-        pair = matched_landmarks([surface] * 2, none[:2])
-        module = build_pair_map(config, phis[0], phis[1], pair).to(DEVICE)
+        module = module_of(config, phis[0], phis[1], none[:2]).to(DEVICE)
+        boundary = module.domain.boundary_samples().to(DEVICE)
 
         def theirs() -> Tensor:
-            return published.pair_map(phis[0].map, phis[1].map, module.map, batch.uv, module.rim)
+            return published.pair_map(phis[0].map, phis[1].map, module.map, batch.uv, boundary)
 
     else:
-        matched = matched_landmarks([surface] * k, none)
-        module = build_collection_map(config, phis, matched)[0].to(DEVICE)
+        module = module_of(config, phis, none).to(DEVICE)
+        boundary = module.domain.boundary_samples().to(DEVICE)
 
         def theirs() -> Tensor:
             return published.collection_map(
-                [p.map for p in phis], list(module.map), batch.uv, module.rim
+                [p.map for p in phis], list(module.map), batch.uv, boundary
             )
 
     module.log_every = NEVER  # there is no logger here
@@ -152,7 +149,7 @@ def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]
 
 
 def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
-    """The matrix products that value, Jacobian and gradients of a network need, and their flops."""
+    """The matrix products of value, Jacobian and gradients of a network, and their flops."""
     layers = [m for m in net.modules() if isinstance(m, nn.Linear)]
     triples = [
         tuple(torch.randn(shape, device=DEVICE) for shape in shapes)
@@ -161,7 +158,7 @@ def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
             for m in layers
         )
     ]
-    bare = isinstance(net.encoding, type(build_map({"encoding": {"name": "identity"}}).encoding))
+    bare = isinstance(net.encoding, Identity)
 
     def run() -> None:
         for a, w, _ in triples:
@@ -177,7 +174,7 @@ def products(net: NeuralMap, batch: int) -> tuple[Step, float]:
 
 
 def peak_rate() -> float:
-    """Flops a second of one large matrix product, the best of some."""
+    """Flops per second of one large matrix product, the best of several."""
     side = 2048 if DEVICE.type == "cpu" else 8192
     a, b = torch.randn(side, side, device=DEVICE), torch.randn(side, side, device=DEVICE)
     best = float("inf")
@@ -189,7 +186,7 @@ def peak_rate() -> float:
 
 
 def costs(rounds: int) -> dict[str, Any]:
-    """(a) a step of each task beside the published recipe."""
+    """(a) A step of each task, and of the published recipe."""
     found = {}
     for settings in SETTINGS:
         for task in TASKS:
@@ -204,11 +201,11 @@ def costs(rounds: int) -> dict[str, Any]:
 
 
 def share_of_peak(rounds: int) -> dict[str, Any]:
-    """(b) a step of overfitting beside its bare matrix products and the machine's best rate."""
+    """(b) A step of overfitting, its matrix products alone, and the machine's best rate."""
     found: dict[str, Any] = {"peak_gflops": peak_rate() / 1e9}
     for settings in SETTINGS:
         config = config_of("overfit", settings)
-        net = build_overfit(config, dome()).map
+        net = module_of(config, dome()).map
         bare, flops = products(net, config.data.batch_size)
         ours = task_steps("overfit", settings)[0]
         taken = in_turn({"nsm": ours, "products": bare}, rounds)
@@ -224,7 +221,7 @@ def share_of_peak(rounds: int) -> dict[str, Any]:
 
 
 def growth(rounds: int) -> dict[str, Any]:
-    """(d) milliseconds of a step as one size changes."""
+    """(d) Milliseconds of a step as one size changes."""
 
     def of(net: NeuralMap, batch: int) -> Step:
         net, x = net.to(DEVICE), 2 * torch.rand(batch, 2, device=DEVICE) - 1
@@ -237,7 +234,7 @@ def growth(rounds: int) -> dict[str, Any]:
         return run
 
     def made(width: int = 128, depth: int = 3) -> NeuralMap:
-        return build_map({"width": width, "depth": depth, "block": "plain"})
+        return NeuralMap(3, width=width, depth=depth, block="plain")
 
     sides = {f"batch/{n}": of(made(), n) for n in (256, 1024, 4096, 16384)}
     sides |= {f"width/{n}": of(made(width=n), 1024) for n in (32, 64, 128, 256, 512)}
@@ -246,41 +243,42 @@ def growth(rounds: int) -> dict[str, Any]:
     found = {key: 1e3 * value for key, value in in_turn(sides, rounds).items()}
     for rings in (30, 100, 300, 580):
         surface = dome(rings)
-        data = OverfitData(surface, batch_size=1024)
+        data = SurfaceData(surface, batch_size=1024)
         data.trainer = None
         data.setup()
         uv, faces = torch.as_tensor(surface.uv, dtype=torch.float32), torch.as_tensor(surface.faces)
-        weakest, h = FoldBarrier(uv, faces).to(DEVICE), made().to(DEVICE)
+        barrier, h = FoldBarrier(uv, faces).to(DEVICE), made().to(DEVICE)
         planar = lambda x, h=h: h(x)[:, :2]  # noqa: E731
 
-        def fifty(data: Any = data, weakest: Any = weakest, planar: Any = planar) -> None:
-            for step in range(50):  # two looks at the triangles
+        def fifty(data: Any = data, barrier: Any = barrier, planar: Any = planar) -> None:
+            for step in range(50):  # the barrier looks at all triangles twice
                 data.batch(step)
-                weakest(planar, step).backward()
+                barrier(planar, step).backward()
 
         found[f"mesh/{len(surface.faces)}"] = 1e3 * in_turn({"": fifty}, 2)[""] / 50
     return found
 
 
-def _held_out(data: OverfitData) -> Samples:
+def _held_out(data: SurfaceData) -> Samples:
     parts = list(data.val_dataloader())
     return Samples(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
-def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limit: float) -> float:
-    """Train until the last step, the limit or a look says so; returns the seconds, looks aside."""
+def _trained(module: Any, data: SurfaceData, config: DictConfig, look: Any, limit: float) -> float:
+    """Train to the last step, the limit, or until ``look`` says so; returns the seconds without
+    those of ``look``."""
     module.log_every = NEVER
     parts = module.configure_optimizers()
-    optimiser, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
+    optimizer, schedule = parts["optimizer"], parts["lr_scheduler"]["scheduler"]
     clip, spent, seen, step = config.trainer.gradient_clip, 0.0, 0.0, 0
     module._step = 0
     while step < config.trainer.max_steps and spent < limit:
         start = clock()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         module.training_step(data.batch(step), 0).backward()
         if clip:
             nn.utils.clip_grad_norm_(module.map.parameters(), clip)
-        optimiser.step()
+        optimizer.step()
         schedule.step()
         step += 1
         module._step = step
@@ -293,11 +291,11 @@ def _trained(module: Any, data: OverfitData, config: DictConfig, look: Any, limi
 
 
 def times(mesh: str, limit: float) -> dict[str, Any]:
-    """(c) seconds until the held-out error, and then the held-out distortion, is low enough, the
-    start by least squares included.
+    """(c) Seconds to given held-out errors, and then to given held-out distortions, including the
+    initialization by least squares.
 
-    The default's schedule ends with its last step, so that it is trained once for each of some
-    lengths and the first good one counts; the published schedule has no end and is followed.
+    The default's schedule ends with its last step, so that it is trained for several lengths and
+    the first good one counts. The published schedule has no end and is measured as it goes.
     """
     surface = Surface.load(mesh)
     found: dict[str, Any] = {"surface": surface.name, "limit_seconds": limit, "overfit": {}}
@@ -306,11 +304,10 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
         config = config_of(name, settings)
         if steps is not None:
             config.trainer.max_steps = steps
-        make = build_overfit if name == "overfit" else build_param
         start = clock()
-        module = _stepping(make(config, phi or surface).to(DEVICE))
+        module = _stepping(module_of(config, phi or surface).to(DEVICE))
         built = clock() - start
-        data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+        data = samples_of(config, surface)
         data.trainer = None
         data.setup()
         return config, module, data, built
@@ -336,19 +333,21 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
             "best_percent": min(value for _, value in curve),
         }
 
-    def distortion(module: Any, uv: Tensor) -> float:
+    def distortion(module: Any, held: Samples) -> float:
         with torch.no_grad():
-            return float(module._distortion(uv)[0].mean)
+            return float(module._evaluated(held)[0].mean)
 
     curves = {"default": [], "paper": []}
     for steps in (25, 50, 100, 200, 400):
         config, module, data, _ = task("param", "default", steps, phi)
-        uv = _held_out(data).uv
-        before = distortion(module, uv)
+        held = _held_out(data)
+        before = distortion(module, held)
         spent = _trained(module, data, config, None, limit)
-        curves["default"].append((spent, distortion(module, uv)))
+        curves["default"].append((spent, distortion(module, held)))
     config, module, data, _ = task("param", "paper", None, phi)
-    _trained(module, data, config, _follow(curves["paper"], lambda: distortion(module, uv)), limit)
+    _trained(
+        module, data, config, _follow(curves["paper"], lambda: distortion(module, held)), limit
+    )
     least = min(value for curve in curves.values() for _, value in curve)
     wanted = [before + share * (least - before) for share in SHARES]
     found["param"] = {"distortion_of_domain": before, "least_distortion": least}
@@ -362,7 +361,7 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
 
 
 def _stepping(module: Any) -> Any:
-    """The module with a step that is counted here: there is no trainer."""
+    """The module with its own count of steps, since there is no trainer."""
     cls = type(module)
     counted = property(lambda self: getattr(self, "_step", 0))
     module.__class__ = type(cls.__name__, (cls,), {"global_step": counted})
@@ -382,7 +381,7 @@ def _first(curve: list[tuple[float, float]], wanted: float) -> float | None:
 
 
 def memory() -> dict[str, Any]:
-    """(e) MiB that a step keeps for its backward pass, beside parameters; on a GPU, its peak."""
+    """(e) MiB that a step stores for its backward pass, without parameters; on a GPU, its peak."""
     found: dict[str, Any] = {}
     for task in TASKS:
         both = zip(("nsm", "published"), task_steps(task, "paper"), strict=True)
@@ -413,25 +412,25 @@ def _kept(step: Step) -> float:
 
 def batches(rounds: int) -> dict[str, Any]:
     """Milliseconds of a step of several surfaces, one after the other and in one batch, and of
-    one surface in compiled form."""
+    one surface with compiled evaluation."""
     config, surface = config_of("overfit", "default"), dome()
-    data = OverfitData(surface, **OmegaConf.to_container(config.data), seed=0)
+    data = samples_of(config, surface)
     data.trainer = None
     data.setup()
     batch = data.batch(0)
-    modules = [build_overfit(config, surface).to(DEVICE) for _ in range(max(TOGETHER))]
+    modules = [module_of(config, surface).to(DEVICE) for _ in range(max(BATCHED))]
 
     def step(one: Callable[[Tensor], tuple[Tensor, Tensor]], uv: Tensor) -> Step:
         def run() -> None:
             value, jacobian = one(uv)
             loss = position(value, batch.points.expand_as(value)).mean()
             turn = normal(jacobian, batch.normals.expand_as(value)).mean()
-            (loss + config.energy.lambda_normal * turn).backward()
+            (loss + config.loss_weights.normal * turn).backward()
 
         return run
 
     found: dict[str, Any] = {}
-    for k in TOGETHER:
+    for k in BATCHED:
         nets = [m.map for m in modules[:k]]
         singly = [step(net.value_and_jacobian, batch.uv) for net in nets]
 
@@ -439,37 +438,37 @@ def batches(rounds: int) -> dict[str, Any]:
             for one in steps:
                 one()
 
-        at_once = step(together(nets).value_and_jacobian, batch.uv.expand(k, -1, -1))
-        taken = in_turn({"one_by_one": one_by_one, "together": at_once}, rounds)
+        at_once = step(batched(nets).value_and_jacobian, batch.uv.expand(k, -1, -1))
+        taken = in_turn({"one_by_one": one_by_one, "batched": at_once}, rounds)
         found[str(k)] = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
-        found[str(k)]["ratio"] = taken["one_by_one"] / taken["together"]
+        found[str(k)]["ratio"] = taken["one_by_one"] / taken["batched"]
     net = modules[0].map
-    compiled, told = Compiled(print), "compiled" if DEVICE.type == "cpu" else "recorded"
+    compiled, kind = Compiled(print), "compiled" if DEVICE.type == "cpu" else "recorded"
     sides = {
         "as_it_is": step(net.value_and_jacobian, batch.uv),
-        told: step(lambda uv: compiled(net.value_and_jacobian, uv), batch.uv),  # type: ignore[arg-type,return-value]
+        kind: step(lambda uv: compiled(net.value_and_jacobian, uv), batch.uv),  # type: ignore[arg-type,return-value]
     }
     taken = in_turn(sides, 10 * rounds)
     found["compiled"] = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
-    found["compiled"]["ratio"] = taken["as_it_is"] / taken[told]
+    found["compiled"]["ratio"] = taken["as_it_is"] / taken[kind]
     print(json.dumps(found, indent=1), flush=True)
     return found
 
 
 def goals(meshes: Path) -> dict[str, Any]:
-    """Seconds by the clock, all in all, of what a user waits for: the bunny as a network of GOAL
-    RMS error, and a map of two animals whose networks are there."""
+    """Wall-clock seconds that a user waits: for the bunny as a network of GOAL RMS error, and for
+    a map of two animals whose networks are trained."""
     found: dict[str, Any] = {"goal_percent": GOAL}
     bunny = Surface.load(str(meshes / "stanford-bunny.obj"))
     marks = [str(meshes / "landmarks" / f"shrec07-{k}.vts") for k in (384, 388)]
     animals = [str(meshes / f"shrec07-{k}.off") for k in (384, 388)]
     ready = nsm.map_pair(*animals, marks, overrides=["trainer.max_steps=1"], progress=False)
     for compiled in (False, True):
-        words = [f"trainer.compile={str(compiled).lower()}"]
+        settings = [f"trainer.compile={str(compiled).lower()}"]
         runs = []
         for steps in LENGTHS:
             start = time.perf_counter()
-            length = [*words, f"trainer.max_steps={steps}"]
+            length = [*settings, f"trainer.max_steps={steps}"]
             phi = nsm.overfit(bunny, overrides=length, progress=False)
             seconds, rms = time.perf_counter() - start, phi.metrics["rms_percent"]
             runs.append({"steps": steps, "seconds": seconds, "rms_percent": rms})
@@ -477,7 +476,11 @@ def goals(meshes: Path) -> dict[str, Any]:
                 break
         start = time.perf_counter()
         f = nsm.map_pair(
-            ready.source, ready.target, ready.landmarks.tolist(), overrides=words, progress=False
+            ready.source,
+            ready.target,
+            ready.landmarks.tolist(),
+            overrides=settings,
+            progress=False,
         )
         seconds = time.perf_counter() - start
         kept = ("symmetric_dirichlet_median", "flipped_percent", "landmark_error_max_percent")
@@ -490,24 +493,25 @@ def goals(meshes: Path) -> dict[str, Any]:
 
 
 def page(results: dict[str, Any]) -> str:
-    """The results as a page of the documentation."""
+    """The results as the page docs/performance.md."""
     on = results["machine"]
     lines = [
         "# Performance",
         "",
-        f"Made by `make bench-speed` on {on['device']}, {on['threads']} thread(s), torch "
-        f"{on['torch']}, float32; {on['clock']}. Sides that are compared ran in turn; medians.",
+        f"`make bench-speed` measured these figures on {on['device']} with {on['threads']} "
+        f"thread(s), torch {on['torch']} and float32. Times are {on['clock']}, medians of "
+        "variants that ran in turn.",
     ]
     if "costs" in results:
         lines += [
             "",
             "## A step of each task",
             "",
-            "Loss and gradient, beside a plain restatement of the published recipe (one "
-            "`autograd.grad` per output, batched SVD and explicit inverse), with the same networks "
+            "Loss and gradient, compared with a plain restatement of the published recipe (one "
+            "`autograd.grad` per output, batched SVD and explicit inverse) for the same networks "
             f"and batch. The collection has {SURFACES} surfaces.",
             "",
-            "| task, settings | published, ms | nsm, ms | times as fast |",
+            "| task, settings | published, ms | nsm, ms | speed-up |",
             "|---|---|---|---|",
         ]
         lines += [
@@ -520,8 +524,8 @@ def page(results: dict[str, Any]) -> str:
             "",
             "## Share of the machine's peak",
             "",
-            "A step of overfitting beside the bare matrix products of its shapes, forward and "
-            "backward, and beside the rate of one large product "
+            "A step of overfitting, compared with its matrix products alone, forward and backward, "
+            "and with the rate of one large product "
             f"({results['peak']['peak_gflops']:.0f} GFLOP/s).",
             "",
             "| settings | step, ms | products, ms | step / products | share of peak | "
@@ -553,7 +557,7 @@ def page(results: dict[str, Any]) -> str:
                 "",
                 f"task={of} on {t['surface']}, on held-out points."
                 + (
-                    f" The domain itself has {t['param']['distortion_of_domain']:.3f}."
+                    f" The domain itself has distortion {t['param']['distortion_of_domain']:.3f}."
                     if of == "param"
                     else ""
                 ),
@@ -573,7 +577,7 @@ def page(results: dict[str, Any]) -> str:
             "width": "width, batch 1,024, 3 layers",
             "depth": "layers, batch 1,024, width 128",
             "surfaces": "surfaces of a collection, settings of the paper",
-            "mesh": "triangles: samples and the watch on folds",
+            "mesh": "triangles: samples and the fold barrier",
         }
         lines += [f"| {names[k]} | {', '.join(v)} |" for k, v in groups.items()]
     if "batches" in results:
@@ -584,27 +588,28 @@ def page(results: dict[str, Any]) -> str:
             "",
             "Loss and gradient of overfitting with the default settings.",
             "",
-            "| surfaces | one by one, ms | together, ms | times as fast |",
+            "| surfaces | one by one, ms | batched, ms | speed-up |",
             "|---|---|---|---|",
         ]
         lines += [
             f"| {k} | {b[str(k)]['one_by_one_milliseconds']:.1f} | "
-            f"{b[str(k)]['together_milliseconds']:.1f} | {b[str(k)]['ratio']:.2f} |"
-            for k in TOGETHER
+            f"{b[str(k)]['batched_milliseconds']:.1f} | {b[str(k)]['ratio']:.2f} |"
+            for k in BATCHED
         ]
         lines += [
             "",
-            "In compiled form (`trainer.compile=true`) a step is "
+            "With compiled evaluation (`trainer.compile=true`) a step is "
             f"{b['compiled']['ratio']:.2f} times as fast.",
         ]
     if "goals" in results:
         g = results["goals"]
         lines += [
             "",
-            "## What a user waits for",
+            "## Waiting time",
             "",
-            f"By the clock: the bunny until its RMS error is {g['goal_percent']} % of the "
-            "diagonal, by trainings of growing length; a map of two animals from their networks.",
+            f"Wall-clock time until the RMS error of the bunny is {g['goal_percent']} % of the "
+            "diagonal, for trainings of growing length; and of a map of two animals from their "
+            "networks.",
             "",
             "| evaluation | bunny: steps, RMS, seconds | map: median distortion, flips, seconds |",
             "|---|---|---|",
@@ -621,7 +626,7 @@ def page(results: dict[str, Any]) -> str:
             "",
             "## Memory",
             "",
-            "What a step with the paper's settings keeps for its backward pass, MiB.",
+            "What a step with the paper's settings stores for its backward pass, in MiB.",
             "",
             "| task | published | nsm | ratio |",
             "|---|---|---|---|",
@@ -636,7 +641,7 @@ def page(results: dict[str, Any]) -> str:
 
 
 def write_page() -> None:
-    """Make the page of the documentation anew of the results that are kept."""
+    """Write docs/performance.md from the stored results."""
     PAGE.write_text(page(json.loads((RESULTS / "speed.json").read_text())))
 
 
@@ -645,13 +650,17 @@ PARTS = ("costs", "peak", "growth", "batches", "memory", "times", "goals")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mesh", default="terrain", help="of the time to an error")
+    parser.add_argument("--mesh", default="terrain", help="mesh for the time to an error")
     parser.add_argument("--seconds", type=float, default=120.0, help="limit of one training")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--meshes", type=Path, help="folder of bunny and animals: adds the goals")
+    parser.add_argument(
+        "--meshes", type=Path, help="folder of bunny and animals: adds the waiting times"
+    )
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="all by default")
-    parser.add_argument("--output", type=Path, help="folder of the JSON; also no page is written")
+    parser.add_argument(
+        "--output", type=Path, help="folder of the JSON file; then no page is written"
+    )
     arguments = parser.parse_args()
     parts = arguments.parts or [p for p in PARTS if p != "goals" or arguments.meshes]
     if "goals" in parts and not (arguments.meshes and arguments.meshes.is_dir()):
@@ -666,7 +675,7 @@ def main() -> None:
         "processor": platform.machine(),
         "torch": torch.__version__,
         "threads": arguments.threads,
-        "clock": "time by the clock" if cuda else "CPU time of the process",
+        "clock": "wall-clock time" if cuda else "CPU time of the process",
     }
     make: dict[str, Callable[[], dict[str, Any]]] = {
         "costs": lambda: costs(arguments.rounds),
@@ -677,7 +686,7 @@ def main() -> None:
         "times": lambda: times(arguments.mesh, arguments.seconds),
         "goals": lambda: goals(arguments.meshes),
     }
-    for part in parts:  # kept one by one: a long run that is stopped has its parts
+    for part in parts:  # stored one by one: an interrupted run keeps what it has
         found = make[part]()
         results = json.loads(output.read_text()) if output.exists() else {}
         results = {**results, "machine": machine, part: found}

@@ -1,13 +1,13 @@
-"""What makes a training need fewer steps: one change from a base at a time, at equal time.
+"""What makes training need fewer steps: one change from a base at a time, at equal time.
 
-Each trial overfits one mesh with the settings of BASE and one thing changed, for a budget of CPU
-time of one thread, from the network's making on, start values included. Errors are taken at marks
-on points that no training sees; that time does not count. A schedule with an end follows the clock:
-it ends with the budget, as with ``trainer.max_steps`` set to the steps that the budget holds,
+Each trial overfits one mesh with the settings of BASE and one change, for a budget of CPU time of
+one thread that includes the initialization of the network. Errors are measured at marks, on points
+that no training sees; the time for that does not count. A schedule with an end follows the clock:
+it ends with the budget, as if ``trainer.max_steps`` were the number of steps in the budget,
 whatever else the machine does.
 
-One JSON file for each mesh and trial; those that are there already are left alone, so that an
-interrupted run goes on where it stopped:
+Each mesh and trial has a JSON file. Existing files are kept, so that an interrupted run continues
+where it stopped:
 
     python benchmarks/steps.py --meshes FOLDER [--names MESH ...] [--only TRIAL ...]
 """
@@ -37,14 +37,14 @@ RESULTS = ROOT / "benchmarks" / "results" / "steps"
 PICTURES = ROOT / "docs" / "pictures"
 NAMES = ("bunny", "shrec07-384", "igea")
 MARKS = (5.0, 10.0, 20.0, 30.0)  # seconds of one thread
-STEPS = 3300  # about what the default makes of the budget
+STEPS = 3300  # of the default within the budget, about
 HELD_OUT = 30_000
-LATE = 1.15  # the first step's end after a mark stands for it when it is no later than this
+LATE = 1.15  # the first step that ends after a mark counts for it up to this factor
 
-# What trials change: the settings that were the default when the first were made, spelt out by
-# group, so that a trial means the same whatever the default has become.
+# The base of all trials: the default settings of the first trials, spelled out by group, so that a
+# trial does not depend on today's default.
 BASE: dict[str, list[str]] = {
-    "start": ["initialization=random"],
+    "initialization": ["initialization=random"],
     "domain": ["domain=disc"],
     "surface": ["surface.parameterization=slim"],
     "map": [
@@ -63,12 +63,12 @@ BASE: dict[str, list[str]] = {
         "encoding.degree=2",
         "encoding.extent=1.05",
     ],
-    "lambda": ["loss_weights=overfit", "energy.lambda_normal=0.01"],
+    "loss_weights": ["loss_weights=overfit", "loss_weights.normal=0.01"],
     "sampler": [
         "sampler=fresh_with_vertices",
-        "data.vertex_share=0.1",
-        "data.domain_share=0",
-        "data.pool=null",
+        "sampler.vertex_share=0.1",
+        "sampler.domain_share=0",
+        "sampler.pool=null",
     ],
     "data": ["data.batch_size=1024"],
     "optimizer": [
@@ -82,7 +82,7 @@ BASE: dict[str, list[str]] = {
     "trainer": ["trainer.gradient_clip=null", "trainer.precision=float32", "trainer.compile=false"],
 }
 
-# the start by least squares, and small rates from there
+# initialization by least squares, then a training at small rates
 START = ["map.linear_skip=fitted", "encoding.resolutions=[32,128,512]"]
 FITTED = [*START, "scheduler.peak=0.003"]
 
@@ -91,13 +91,13 @@ GAUSS_NEWTON = ["candidate=gauss_newton", "optimizer.lr=1", "scheduler.warmup=0"
 SOAP = ["optimizer=muon", "candidate=preconditioned", "candidate.kind=soap"]
 SHAMPOO = [*SOAP[:-1], "candidate.kind=shampoo"]
 
-# by topic, what is changed from BASE
+# the changes from BASE, by topic
 TRIALS: dict[str, dict[str, list[str]]] = {
     "default": {
         "default": [],
         "default, seed 1": ["seed=1"],
         "default, seed 2": ["seed=2"],
-        # of a mesh whose other rows were made on a layout that is no longer what is made
+        # for a mesh whose other rows were measured on an earlier layout
         "default, new layout": [],
         "default, new layout, seed 1": ["seed=1"],
         "paper": ["experiment=paper"],
@@ -144,7 +144,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
             "optimizer.lr=1e-3",
             "optimizer.encoding_lr=1e-4",
         ],
-        # what became the default, initialization=fitted
+        # today's default, initialization=fitted
         "fitted, grid 32, 128, 512": FITTED,
         "fitted, Fourier, 64": ["map.linear_skip=fitted", "encoding=fourier"],
     },
@@ -153,7 +153,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "Gauss–Newton, batch 4,096": [*GAUSS_NEWTON, "data.batch_size=4096"],
         "Gauss–Newton, batch 16,384": [*GAUSS_NEWTON, "data.batch_size=16384"],
     },
-    # all of grid 32, 128, 512
+    # all with grid 32, 128, 512
     "from the fitted start": {
         "fitted, hardly trained": [*START, "scheduler.peak=3e-6"],
         "fitted, Muon": [*FITTED, "optimizer=muon"],
@@ -179,9 +179,9 @@ TRIALS: dict[str, dict[str, list[str]]] = {
     "samples": {
         "no vertices": ["sampler=fresh"],
         "no vertices, new layout": ["sampler=fresh"],
-        "half vertices": ["data.vertex_share=0.5"],
-        "half uniform in Ω": ["data.domain_share=0.5"],
-        "a fifth uniform in Ω": ["data.domain_share=0.2"],
+        "half vertices": ["sampler.vertex_share=0.5"],
+        "half uniform in Ω": ["sampler.domain_share=0.5"],
+        "a fifth uniform in Ω": ["sampler.domain_share=0.2"],
         "pool of 500,000": ["sampler=pool"],
         "by error": ["candidate=by_error"],
         "by error, seed 1": ["candidate=by_error", "seed=1"],
@@ -192,7 +192,7 @@ TRIALS: dict[str, dict[str, list[str]]] = {
         "batch 2,048": ["data.batch_size=2048"],
         "batch 8,192": ["data.batch_size=8192"],
     },
-    "optimiser": {
+    "optimizer": {
         "AdamW": ["optimizer=adamw", "optimizer.lr=3e-3", "optimizer.encoding_lr=3e-2"],
         "RMSProp": ["optimizer=rmsprop", "optimizer.lr=3e-3", "+optimizer.encoding_lr=3e-2"],
         "SGD": ["optimizer=sgd", "optimizer.lr=3e-2", "+optimizer.encoding_lr=10"],
@@ -220,45 +220,46 @@ TRIALS: dict[str, dict[str, list[str]]] = {
     },
     "loss": {
         "no normals": ["loss_weights=positions"],
-        "λ_n = 0.001": ["energy.lambda_normal=0.001"],
+        "λ_n = 0.001": ["loss_weights.normal=0.001"],
     },
 }
 
 
 def in_full(changes: list[str]) -> list[str]:
-    """All words of a trial: BASE but for the groups that it chooses itself, and its changes.
+    """All settings of a trial: its changes, and BASE for the groups that it does not choose.
 
-    An experiment is a whole of its own, without BASE.
+    An experiment replaces BASE.
     """
     chosen = {change.partition("=")[0] for change in changes}
     if "experiment" in chosen:
         return changes
-    return [word for group in BASE if group not in chosen for word in BASE[group]] + changes
+    kept = [setting for group in BASE if group not in chosen for setting in BASE[group]]
+    return kept + changes
 
 
-def trial(words: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
-    """Errors at the marks of one mesh's training with these overrides."""
-    words, candidate = parted(words)
-    config = compose_config([*words, f"trainer.max_steps={STEPS}"])
+def trial(settings: list[str], name: str, meshes: Path | None) -> dict[str, Any]:
+    """Errors at the marks while one mesh is overfitted with these settings."""
+    settings, candidate = parted(settings)
+    config = compose_config([*settings, f"trainer.max_steps={STEPS}"])
     place = {"domain": config.domain, "parameterization": config.surface.parameterization}
     surface = surface_of(name, meshes, **place)
     curve: list[dict[str, Any]] = []
 
     def at_mark(module: Any, seconds: float, step: int) -> None:
-        if clock.spent > LATE * seconds:  # the start took longer: there was nothing yet
+        if clock.spent > LATE * seconds:  # the initialization took longer than the mark
             return
         found = pointwise_metrics(surface, module.map.eval(), samples=HELD_OUT)
         curve.append({"cpu_seconds": seconds, "steps": step, **found})
         module.map.train()
 
     clock = OnTheClock(MARKS, at_mark)
-    piece = partial(exchanged, words=candidate, progress=lambda: clock.progress)
+    piece = partial(exchanged, settings=candidate, progress=lambda: clock.progress)
     module = train(config, surface, [clock], max_steps=-1, exchanged=piece)[1]
     return {"curve": curve, "wrinkles": normal_variation(surface, module.map.eval())}
 
 
 def slug(trial_name: str) -> str:
-    """A trial's name as a file's."""
+    """The file name of a trial."""
     plain = trial_name.replace("×", "x").replace("σ", "sigma").replace("λ", "lambda")
     plain = plain.replace("β₂", "beta2").replace("Ω", "domain")
     plain = re.sub(r"(?<=\d\d),(?=\d{3})", "", plain)
@@ -266,7 +267,7 @@ def slug(trial_name: str) -> str:
 
 
 def results() -> dict[str, dict[str, Any]]:
-    """All that is there: mesh to trial to what was found, in the order of TRIALS."""
+    """All stored results: mesh to trial to result, in the order of TRIALS."""
     found: dict[str, dict[str, Any]] = {}
     for name in NAMES:
         for trials in TRIALS.values():
@@ -297,7 +298,7 @@ def tables() -> str:
 
 
 def picture(name: str, found: dict[str, Any]) -> None:
-    """The curves of one mesh, a panel for each topic, the default in each."""
+    """Draw the curves of one mesh: a panel for each topic, with the default in each."""
     from cycler import cycler
     from matplotlib.colors import TABLEAU_COLORS
     from matplotlib.figure import Figure
@@ -341,7 +342,7 @@ def main() -> None:
     parser.add_argument("--meshes", type=Path, help="folder with the mesh files; else fetched")
     parser.add_argument("--names", nargs="+", default=list(NAMES), choices=list(MESHES))
     parser.add_argument("--only", nargs="+", default=every, choices=every, metavar="TRIAL")
-    parser.add_argument("--no-tables", action="store_true", help="leave table and pictures")
+    parser.add_argument("--no-tables", action="store_true", help="write no table or pictures")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     quiet_lightning()
@@ -353,7 +354,7 @@ def main() -> None:
                 file = RESULTS / name / f"{slug(key)}.json"
                 if file.exists():
                     continue
-                words = {
+                result = {
                     "mesh": name,
                     "topic": topic,
                     "trial": key,
@@ -363,8 +364,8 @@ def main() -> None:
                     **trial(in_full(trials[key]), name, arguments.meshes),
                 }
                 file.parent.mkdir(parents=True, exist_ok=True)
-                atomic_write(file, (json.dumps(words, indent=1) + "\n").encode())
-                last = words["curve"][-1]
+                atomic_write(file, (json.dumps(result, indent=1) + "\n").encode())
+                last = result["curve"][-1]
                 console.print(f"{name}, {key}: {last['rms_percent']:.3f} %")
     if arguments.no_tables:
         return

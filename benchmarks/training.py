@@ -1,4 +1,4 @@
-"""Trainings as the benchmarks run them: on one thread of the CPU, by its time."""
+"""Trainings of the benchmarks: on one thread of the CPU, measured by CPU time."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
-from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning.callbacks import Callback
-
-from nsm.data import OverfitData
 from nsm.domains import Surface
-from nsm.pipeline import build_overfit
+from omegaconf import DictConfig
+from pytorch_lightning.callbacks import Callback
+from rich.console import Console
+
+from nsm.data import SurfaceData
+from nsm.instantiation import made
+from nsm.pipeline import built, make_task
 from nsm.tasks import Overfit
 
 MESHES = {
@@ -26,12 +28,12 @@ MESHES = {
 
 
 def surface_of(name: str, meshes: Path | None, **settings: Any) -> Surface:
-    """A mesh of a folder, or, without one, of the catalogue, prepared."""
+    """The prepared surface of a mesh in a folder, or of the catalogue if there is no folder."""
     return Surface.load(meshes / MESHES[name] if meshes else name, **settings)
 
 
 class Clock(Callback):
-    """Stop after a budget of CPU time; call back at marks. Time spent there does not count."""
+    """Stop after a budget of CPU time; call back at marks, whose time does not count."""
 
     def __init__(self, marks: Sequence[float], at_mark: Callable[[Any, float, int], None]) -> None:
         self.marks, self.at_mark = list(marks), at_mark
@@ -40,7 +42,7 @@ class Clock(Callback):
 
     @property
     def spent(self) -> float:
-        """Seconds of the CPU since the clock was made, but for those at marks."""
+        """CPU seconds since the clock was created, without those at marks."""
         return time.process_time() - self.start - self.aside
 
     def on_train_batch_end(
@@ -55,21 +57,36 @@ class Clock(Callback):
 
 
 class OnTheClock(Clock):
-    """A schedule that comes to an end does so with the budget."""
+    """A clock by which a schedule with an end ends with the budget."""
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent."""
+        """The share of the budget that has been spent, in [0, 1]."""
         return min(1.0, self.spent / self.budget)
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         def by_time(factor: Any) -> Any:
             return lambda _: factor(pl_module.hparams["max_steps"] * self.progress)
 
-        if pl_module.hparams["scheduler"]["name"] == "cosine":
+        if pl_module.hparams["scheduler"]["_target_"].endswith(".Cosine"):
             for configured in trainer.lr_scheduler_configs:
                 scheduler: Any = configured.scheduler
                 scheduler.lr_lambdas = [by_time(factor) for factor in scheduler.lr_lambdas]
+
+
+def module_of(config: DictConfig, *inputs: Any) -> Any:
+    """The module that a task trains, for prepared inputs: those of the task's method ``use``."""
+    task: Any = make_task(config, Console(quiet=True))
+    task.use(*inputs)
+    return built(task)
+
+
+def samples_of(
+    config: DictConfig, surface: Surface, kind: type[SurfaceData] = SurfaceData
+) -> SurfaceData:
+    """The data module of a configuration, or one of another class with its settings."""
+    settings = {key: value for key, value in config.data.items() if key != "_target_"}
+    return kind(surface, made(config.sampler), **settings, seed=config.seed)
 
 
 def train(
@@ -79,18 +96,18 @@ def train(
     max_steps: int | None = None,
     exchanged: Callable[[Overfit], Overfit] = lambda module: module,
 ) -> tuple[pl.Trainer, Any, float]:
-    """The trainer, the module and the seconds of the CPU that the training took.
+    """Train a network on a surface; returns the trainer, the module and the CPU seconds.
 
     Args:
-        config, surface: what is trained.
+        config: settings of task=overfit.
+        surface: the prepared surface.
         callbacks: of Lightning.
-        max_steps: after which the training ends, -1 for never; without it where its schedule does.
-        exchanged: from the product's module to the one that is trained.
+        max_steps: length of the training, -1 without limit; that of its schedule by default.
+        exchanged: from nsm's module to the one that is trained.
     """
     start = time.process_time()
-    module = exchanged(build_overfit(config, surface))
-    samples = getattr(module, "samples", OverfitData)
-    data = samples(surface, **OmegaConf.to_container(config.data), seed=config.seed)
+    module = exchanged(module_of(config, surface))
+    data = samples_of(config, surface, getattr(module, "samples", SurfaceData))
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
             accelerator="cpu",

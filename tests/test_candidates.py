@@ -1,4 +1,4 @@
-"""The pieces of benchmarks/candidates.py are what they are said to be."""
+"""The candidates of the benchmarks compute what their docstrings say."""
 
 import sys
 from functools import partial
@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 from pytorch_lightning.callbacks import Callback
 
 import nsm
 from nsm.config import compose_config
 from nsm.data import SurfaceSampler
-from nsm.maps import NeuralMap
-from nsm.maps.encodings import ENCODINGS
+from nsm.maps.networks import build_network
 from nsm.tasks import Overfit
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
@@ -21,12 +22,18 @@ import candidates  # noqa: E402
 import steps  # noqa: E402
 from training import train  # noqa: E402
 
-GRID = {"name": "spline_grid", "resolutions": [4, 8], "features": 3}
-MAP = {"width": 8, "depth": 1, "block": "plain", "encoding": GRID}
+GRID = {"_target_": "nsm.maps.encodings.SplineGrid", "resolutions": [4, 8], "features": 3}
+MAP = {"_target_": "nsm.maps.NeuralMap", "width": 8, "depth": 1, "block": "plain"}
+NETWORK = {
+    "map": MAP,
+    "activation": {"_target_": "nsm.maps.activations.Softplus", "beta": 10.0},
+    "encoding": GRID,
+}
 SETTINGS = {
-    "optimizer": {"name": "adam", "lr": 1e-3, "encoding_lr": 1e-2},
-    "scheduler": {"name": "constant"},
-    "lambda_normal": 0.01,
+    **NETWORK,
+    "optimizer": {"_target_": "torch.optim.Adam", "lr": 1e-3, "encoding_lr": 1e-2},
+    "scheduler": {"_target_": "nsm.tasks.schedules.Constant"},
+    "loss_weights": {"normal": 0.01},
     "max_steps": 10,
     "diagonal": 1.0,
 }
@@ -46,14 +53,15 @@ def batch_of(surface, count, dtype=torch.float64):
 @pytest.fixture
 def network():
     torch.manual_seed(0)
-    network = NeuralMap(**MAP, linear_skip="linear").double()
+    network = build_network(**{**NETWORK, "map": {**MAP, "linear_skip": "linear"}}, out_dim=3)
+    network = network.double()
     torch.nn.init.normal_(network.linear_skip.weight)
     return network
 
 
 def test_the_squared_residuals_are_the_loss(network, surface):
     batch = batch_of(surface, 50)
-    module = Overfit(map=network.config, **SETTINGS)
+    module = Overfit(**SETTINGS)
     module.map, module.log_every = network, 2  # nothing is logged
     loss = module.training_step(batch, 0)
     residual = candidates.residuals(network, batch, 0.01)
@@ -71,8 +79,8 @@ def test_products_are_those_of_the_jacobian(network, surface):
     rows = [torch.autograd.grad(entry, parameters, retain_graph=True) for entry in residual]
     jacobian = torch.stack([torch.cat([part.flatten() for part in row]) for row in rows])
     v, u = torch.randn(jacobian.shape[1]).double(), torch.randn(len(residual)).double()
-    torch.testing.assert_close(products.push(v), jacobian @ v)
-    torch.testing.assert_close(products.pull(u), jacobian.T @ u)
+    torch.testing.assert_close(products.jvp(v), jacobian @ v)
+    torch.testing.assert_close(products.vjp(u), jacobian.T @ u)
     # J v once more, by differences
     step = 1e-6 * v
     moved = []
@@ -82,7 +90,7 @@ def test_products_are_those_of_the_jacobian(network, surface):
         moved.append(candidates.residuals(network, batch, 0.01).detach())
         for p, part in zip(parameters, step.split([p.numel() for p in parameters]), strict=True):
             p.data -= sign * part.view_as(p)
-    torch.testing.assert_close((moved[0] - moved[1]) / 2e-6, products.push(v), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close((moved[0] - moved[1]) / 2e-6, products.jvp(v), rtol=1e-5, atol=1e-6)
 
 
 def test_a_damped_step_solves_its_system():
@@ -108,11 +116,11 @@ def test_a_damped_step_solves_its_system():
     solved = torch.linalg.solve(design.T @ design + 0.5 * torch.diag(held), design.T @ wanted)
     # the diagonal is known to a few percent
     torch.testing.assert_close(torch.cat([p, q]).detach(), solved, rtol=0.05, atol=0.01)
-    # a linear residual: what is promised comes, and the damping stays at its least
+    # the residual is linear: the prediction is exact, and the damping stays at its least
     assert float(closure().detach()) < before and optimizer.damping == 0.5
 
 
-def test_weights_give_the_mean_by_area_back(surface):
+def test_weights_restore_the_mean_by_area(surface):
     sampler = candidates.ErrorSampler(surface)
     centres = surface.vertices[surface.faces].mean(axis=1)
     sampler.error = torch.as_tensor(np.exp(3 * centres[:, 2]))
@@ -125,7 +133,7 @@ def test_weights_give_the_mean_by_area_back(surface):
     assert float(height.mean()) > wanted + 10 * spread
 
 
-def test_errors_draw_samples_to_their_triangles(surface):
+def test_triangles_with_larger_errors_are_sampled_more(surface):
     sampler = candidates.ErrorSampler(surface)
     face, weight = torch.tensor([7, 8]), torch.ones(2)
     for _ in range(20):
@@ -150,7 +158,7 @@ def test_a_hash_grids_jacobian_is_its_derivative(log2_rows):
 
 
 def test_levels_are_released_in_turn():
-    module = candidates.CoarseToFine(map=MAP, **SETTINGS)
+    module = candidates.CoarseToFine(**SETTINGS)
     module.progress = lambda: 0.0
     module.on_fit_start()
     coarse, fine = module.map.encoding.tables
@@ -165,8 +173,9 @@ def test_levels_are_released_in_turn():
 def test_only_matrices_are_preconditioned(kind):
     pytest.importorskip("pytorch_optimizer")
     torch.manual_seed(0)
-    settings = {**SETTINGS, "optimizer": {"name": "muon", "lr": 1e-2, "encoding_lr": 1e-2}}
-    module = candidates.Preconditioned(map=MAP, kind=kind, every=2, **settings)
+    muon = compose_config(["optimizer=muon", "optimizer.lr=1e-2", "optimizer.encoding_lr=1e-2"])
+    settings = {**SETTINGS, "optimizer": OmegaConf.to_container(muon.optimizer)}
+    module = candidates.Preconditioned(kind=kind, every=2, **settings)
     optimizer = module.optimizer()
     names = {id(p): name for name, p in module.map.named_parameters()}
     matrices, *others = ([names[id(p)] for p in g["params"]] for g in optimizer.param_groups)
@@ -186,7 +195,7 @@ def test_only_matrices_are_preconditioned(kind):
 
 
 @pytest.mark.parametrize(
-    "words",
+    "settings",
     [
         ["candidate=gauss_newton", "optimizer.lr=1", "candidate.iterations=2"],
         [
@@ -201,18 +210,19 @@ def test_only_matrices_are_preconditioned(kind):
         ["candidate=coarse_to_fine"],
         ["encoding=hash_grid"],
     ],
-    ids=lambda words: words[-1],
+    ids=lambda settings: settings[-1],
 )
-def test_a_candidate_trains(words, surface, request):
-    if "candidate.kind=soap" in words:
+def test_a_candidate_trains(settings, surface, request):
+    if "candidate.kind=soap" in settings:
         pytest.importorskip("pytorch_optimizer")
-    if "encoding=hash_grid" in words:
+    if "encoding=hash_grid" in settings:
         candidates.register()
-        # other tests look at what there is to choose
-        request.addfinalizer(lambda: ENCODINGS.pop("hash_grid"))
-    settings, own = candidates.parted(steps.in_full(words))
-    small = [] if "encoding=hash_grid" in words else ["encoding.resolutions=[4,16]"]
-    config = compose_config([*settings, *small, "data.batch_size=64", "trainer.max_steps=8"])
+        # other tests look at the options of the group
+        options = ConfigStore.instance().repo["encoding"]
+        request.addfinalizer(lambda: options.pop("hash_grid.yaml"))
+    of_nsm, own = candidates.parted(steps.in_full(settings))
+    small = [] if "encoding=hash_grid" in settings else ["encoding.resolutions=[4,16]"]
+    config = compose_config([*of_nsm, *small, "data.batch_size=64", "trainer.max_steps=8"])
     sizes, losses = [], []
 
     class Watch(Callback):
@@ -225,9 +235,9 @@ def test_a_candidate_trains(words, surface, request):
 
     trainer, module, _ = train(config, surface, [Watch()], exchanged=piece)
     assert trainer.global_step == 8 and losses[-1] < losses[0]
-    assert module.map.output.weight.any()  # zero at the start where it is fitted
+    assert module.map.output.weight.any()  # zero at first where it is fitted
     assert isinstance(module, candidates.Candidate) == bool(own)
-    if "candidate=growing_batch" in words:
+    if "candidate=growing_batch" in settings:
         assert sizes[0] == 64 and sizes[-1] == 256 and sizes == sorted(sizes)
     else:
         assert set(sizes) == {64}

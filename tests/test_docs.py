@@ -1,40 +1,241 @@
-"""The documentation builds without warnings, and what it is made of is all there."""
+"""The documentation builds, its code runs, its commands compose, its figures were measured."""
 
+import json
 import os
 import re
-import shlex
 import subprocess
 import sys
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 
 import pytest
-from hydra.core.override_parser.overrides_parser import OverridesParser
+import yaml
+from doc_pages import PAGES, ROOT, blocks, commands, inline_code, jobs, overrides, prose, run_python
 
 import nsm
-from nsm.config import conf_folder
-from nsm.config_docs import groups
-from nsm.maps import build_analytic
+from nsm.config import compose_config
 
-ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+CONF = ROOT / "conf"
+RESULTS = ROOT / "benchmarks" / "results"
+DATA = {"text", "bibtex", "yaml", "json"}  # languages of blocks that are not code
+# blocks that are not run, by page: this list shall stay short
+NOT_RUN: dict[str, list[str]] = {}
+# tests/test_extending.py runs this page, and looks at what it defines
+OWN_TEST = "extending"
+PLAIN = [page for page in PAGES if page.stem != OWN_TEST]
+TASKS = ["task=overfit", "task=param", "task=pair_map", "task=collection_map"]
+ARGUMENTS = {"overrides", "folder", "candidate"}  # of functions, and of the benchmarks
+OTHER_COMMANDS = {"ssh", "tensorboard"}
+
+
+def by_name(page: Path) -> str:
+    return page.stem
+
+
+# Code
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_blocks_name_their_language(page):
+    found = blocks(page)
+    assert page.read_text(encoding="utf-8").count("\n```") == 2 * len(found)
+    assert {block.language for block in found} <= {"python", "sh", *DATA}
+    assert [b.reason for b in found if b.reason is not None] == NOT_RUN.get(page.stem, [])
+    for block in found:
+        if block.language == "yaml":
+            assert yaml.safe_load(block.text)
+        if block.language == "json":
+            assert json.loads(block.text)
+
+
+@pytest.mark.parametrize("page", [p for p in PLAIN if blocks(p, "python")], ids=by_name)
+def test_python_runs_as_it_stands(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_python(page)
+
+
+def test_each_public_function_has_an_example():
+    code = "".join(block.text for page in PAGES for block in blocks(page, "python"))
+    functions = [name for name in nsm.__all__ if not isinstance(getattr(nsm, name), type)]
+    assert [name for name in functions if f"nsm.{name}(" not in code] == []
+
+
+# Commands
+
+
+@pytest.mark.parametrize("page", [p for p in PLAIN if blocks(p, "sh")], ids=by_name)
+def test_commands_can_be_given(page, capsys):
+    for words in commands(page):
+        program, *rest = words
+        if program == "nsm":
+            check_nsm(rest, capsys)
+        elif program == "make":
+            check_make(rest)
+        elif program == "pip":
+            check_pip(rest)
+        else:
+            assert program in OTHER_COMMANDS, words
+
+
+def check_nsm(words, capsys):
+    if words[0] in ("report", "view"):
+        with pytest.raises(SystemExit):
+            import_module(f"nsm.commands.{words[0]}").main(["--help"])
+        described = capsys.readouterr().out
+        assert all(word in described for word in words if word.startswith("-"))
+    elif words[0] == "--help":
+        import_module("nsm.help").main(words[1:])
+    else:
+        for job in jobs(overrides(words)):
+            compose_config(job)
+
+
+def check_make(words):
+    rules = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)
+    assert {word for word in words if "=" not in word} <= set(rules)
+
+
+def check_pip(words):
+    assert words[0] == "install"
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    extras = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    for word in words[1:]:
+        name, _, asked = word.rstrip("]").partition("[")
+        assert name in (".", "nsm")
+        assert all(f"\n{extra} = " in extras for extra in asked.split(",") if extra)
+
+
+@pytest.mark.parametrize("page", PLAIN, ids=by_name)
+def test_settings_in_the_text_exist(page):
+    for code in set(inline_code(page)):
+        program, *words = code.split()
+        if program == "make":
+            check_make(words)
+        elif re.fullmatch(r"nsm\[[\w,]+\]", code):
+            check_pip(["install", code])
+        elif re.fullmatch(r"(hydra/|\+)?[a-z_][a-z_.]*=[\w.,\[\]-]+", code):
+            assert composes(code), f"{page.name}: {code}"
+
+
+def composes(setting):
+    """Whether a setting can be given to one of the tasks."""
+    key, _, value = setting.partition("=")
+    if key in ARGUMENTS or value.isupper() or value == "...":
+        return True
+    if (CONF / key).is_dir():  # a group; what an option needs may not be installed
+        return (CONF / key / f"{value}.yaml").exists()
+    choices = TASKS
+    if key.startswith("hydra."):
+        group = CONF / "hydra" / key.split(".")[1]
+        choices = [f"hydra/{group.name}={file.stem}" for file in group.glob("*.yaml")]
+    for choice in choices:
+        try:
+            compose_config([choice, setting])
+        except nsm.NsmError:
+            continue
+        return True
+    return False
+
+
+# Figures
+
+
+def rows(text):
+    """The cells of the tables in a page, but for the first column and for rows without figures."""
+    lines = re.findall(r"^\|(.+)\|$", text, re.MULTILINE)
+    cells = [tuple(cell.strip() for cell in line.split("|")) for line in lines]
+    return {row[1:] for row in cells if any(re.match(r"[\d*]", cell) for cell in row[1:])}
+
+
+@pytest.mark.parametrize(
+    ("page", "heading", "files"),
+    [
+        ("maps", "## Measurements", ["maps.md"]),
+        ("optimization", "## Error over time", ["overfit.md", "steps.md"]),
+        ("activations", "| activation |", ["activation.md"]),
+        ("robustness", "<!-- table -->", ["torture.md"]),
+    ],
+)
+def test_tables_hold_what_was_measured(page, heading, files):
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    measured = set().union(*(rows((RESULTS / file).read_text(encoding="utf-8")) for file in files))
+    shown = rows(text[text.index(heading) :])
+    assert shown and shown - measured == set()
+
+
+def test_the_figures_of_the_front_page_were_measured():
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    runs = json.loads((RESULTS / "overfit.json").read_text())["runs"]
+    for key in ("bunny/default/0.5", "bunny/paper/60"):
+        found, minutes = runs[key]["metrics"], key.split("/")[-1]
+        assert re.search(
+            rf"{found['rms_percent']:.3f} %.*{found['normal_error_mean_degrees']:.1f}°.*"
+            rf"\| {minutes} min",
+            page,
+        )
+    pair = json.loads((RESULTS / "maps" / "cat-horse.json").read_text())
+    median = pair["metrics"]["symmetric_dirichlet_median"]
+    assert re.search(rf"{median:.3f} \(4 at best.*\| {pair['map_seconds']:.0f} s", page)
+    assert pair["metrics"]["flipped_percent"] == 0
+    group = json.loads((RESULTS / "maps" / "collection.json").read_text())
+    pairs = group["metrics"]["pairs"].values()
+    medians = sorted(found["symmetric_dirichlet_median"] for found in pairs)
+    assert len(medians) == 12 and not any(found["flipped_percent"] for found in pairs)
+    assert f"{medians[0]:.3f} to {medians[-1]:.3f}" in page
+    assert f"| {group['map_seconds']:.0f} s" in page
+    flat = json.loads((RESULTS / "maps" / "param-cow_free.json").read_text())
+    ours, slim = (flat["flattening"][method] for method in ("nsm", "SLIM (libigl)"))
+    assert (ours["flipped_percent"], ours["boundary_self_intersections"]) == (0, 0)
+    key = "symmetric_dirichlet_median"
+    assert re.search(rf"{ours[key]:.3f}.*{slim[key]:.3f} \| {flat['map_seconds']:.0f} s", page)
+
+
+def test_the_performance_page_is_made_from_its_results(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    speed = import_module("speed")
+    results = json.loads((RESULTS / "speed.json").read_text())
+    assert speed.PAGE.read_text(encoding="utf-8") == speed.page(results)
+
+
+def test_links_lead_somewhere():
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", prose(page)):
+            assert (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+# The site
 
 
 class Page(HTMLParser):
-    """A page's text, and the ids in it."""
+    """A page's ids, and the rows of its tables by the heading that they stand under."""
 
     def __init__(self, file: Path) -> None:
         super().__init__()
-        self.words: list[str] = []
         self.ids: set[str] = set()
+        self.rows: dict[str, list[list[str]]] = {}
+        self.heading, self.into, self.text = "", "", ""
         self.feed(file.read_text(encoding="utf-8"))
-        self.text = " ".join("".join(self.words).split())
 
     def handle_starttag(self, tag, attributes):
         self.ids.update(value for key, value in attributes if key == "id")
+        if tag == "tr":
+            self.rows[self.heading].append([])
+        if tag in ("h1", "h2", "h3", "td"):
+            self.into, self.text = tag, ""
 
     def handle_data(self, data):
-        self.words.append(data)
+        self.text += data
+
+    def handle_endtag(self, tag):
+        if tag != self.into:
+            return
+        text, self.into = " ".join(self.text.split()), ""
+        if tag == "td":
+            self.rows[self.heading][-1].append(text)
+        else:
+            self.heading = text.removesuffix("¶").strip()
+            self.rows.setdefault(self.heading, [])
 
 
 @pytest.fixture(scope="module")
@@ -58,34 +259,44 @@ def test_every_page_is_reached_from_the_front(site):
         assert f'href="{page.stem}.html"' in front
 
 
-def test_settings_are_those_of_the_configuration(site):
-    page = Page(site / "settings.html")
-    for group in groups():
-        files = {file.stem for file in (conf_folder() / group.name).glob("*.yaml")}
-        shown = {name for name in files if f"{group.name}={name}" in page.text}
-        assert shown == files
-        for setting in (s for option in group.options for s in option.settings):
-            row = f"{setting.key} {setting.value} {setting.remark}".strip()
-            assert row.replace("`", "") in page.text
-
-
 def test_everything_public_is_in_the_reference(site):
     assert {f"nsm.{name}" for name in nsm.__all__} <= Page(site / "api.html").ids
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_the_words_of_commands_can_be_read(page):
-    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    commands = re.findall(r"^(?:\$ )?nsm ([^|\n]*)", text, re.MULTILINE)
-    inline = re.findall(r"`(?:nsm )?([\w.+]+=[^`|\n]+)`", text)
-    lines = [shlex.split(line, comments=True) for line in [*commands, *inline]]
-    words = [
-        word
-        for line in lines
-        if line[0] not in ("report", "view") and not {"...", "-sc"} & set(line)
-        for word in line
-        if not word.startswith("-") and "=" in word
-    ]
-    for read in OverridesParser.create().parse_overrides(words):
-        if read.get_key_element() == "target" and isinstance(read.value(), dict):
-            build_analytic(read.value())
+def test_every_option_of_the_configuration_is_on_the_settings_page(site):
+    """The files of conf/ are read here without nsm's own code, which writes the page."""
+    shown = Page(site / "settings.html").rows
+    options = [file for file in CONF.glob("*/*.yaml") if file.parent.name != "hydra"]
+    assert len(options) > 40
+    for file in options:
+        group = file.parent.name
+        heading = f"{group}={file.stem}"
+        assert heading in shown
+        text = file.read_text(encoding="utf-8")
+        content = yaml.safe_load(text) or {}
+        if "# @package _global_" in text or "@package" in text:
+            continue  # of other groups: see below
+        values = {row[0]: row[1] for row in shown[heading] if row}
+        for key, value in content.items():
+            if key not in ("defaults", "_target_") and not isinstance(value, dict):
+                assert yaml.safe_load(values[f"{group}.{key}"]) == value
+
+
+@pytest.mark.parametrize(
+    ("option", "key", "value"),
+    [
+        ("activation=softplus", "activation.beta", 10.0),
+        ("map=mlp", "map.width", 64),
+        ("encoding=spline_grid", "encoding.resolutions", [32, 128, 512]),
+        ("optimizer=adam", "optimizer.lr", 3e-3),
+        ("scheduler=cosine", "scheduler.warmup", 100),
+        ("sampler=fresh_with_vertices", "sampler.vertex_share", 0.1),
+        ("loss_weights=overfit", "loss_weights.normal", 0.01),
+        ("loss_weights=pair", "loss_weights.triangles", 100.0),
+        ("constraints=pair", "constraints.multiplier_every", 50),
+        ("data=planar", "data.batch_size", 2048),
+    ],
+)
+def test_the_settings_page_gives_the_default(site, option, key, value):
+    values = {row[0]: row[1] for row in Page(site / "settings.html").rows[option] if row}
+    assert yaml.safe_load(values[key]) == value

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """An environment with nothing of ours but the wheel; the dependencies are borrowed."""
+    """An environment that has only the wheel; dependencies come from the current environment."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
     built = subprocess.run([*build, str(ROOT)], capture_output=True, text=True)
@@ -27,8 +27,8 @@ def installed(tmp_path_factory) -> Path:
     pip = [sys.executable, "-m", "pip", "--quiet", "install", "--no-deps", "--target", str(site)]
     result = subprocess.run([*pip, str(wheel)], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    borrowed = [p for p in sys.path if p.endswith("site-packages")]
-    (site / "borrowed.pth").write_text("\n".join(borrowed))
+    dependencies = [p for p in sys.path if p.endswith("site-packages")]
+    (site / "dependencies.pth").write_text("\n".join(dependencies))
     return python
 
 
@@ -42,11 +42,11 @@ def test_it_runs_from_another_folder(installed, tmp_path):
         capture_output=True,
         text=True,
     )
-    assert str(ROOT) not in where.stdout, "the clone answered instead of the wheel"
+    assert str(ROOT) not in where.stdout, "the clone was imported instead of the wheel"
     assert Path(where.stdout.strip()).name == "conf"
-    words = ["surface=hemisphere", "experiment=quick", "trainer.max_steps=50", "logger=none"]
+    settings = ["surface=hemisphere", "experiment=quick", "trainer.max_steps=50", "logger=none"]
     result = subprocess.run(
-        [installed, "-m", "nsm.cli", *words],
+        [installed, "-m", "nsm.cli", *settings],
         cwd=tmp_path,
         env=environment,
         capture_output=True,
