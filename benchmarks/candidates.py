@@ -14,19 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from hydra.core.config_store import ConfigStore
-from nsm.domains import Surface
-from nsm.tasks.schedules import scheduled
 from omegaconf import OmegaConf
 from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsm.data import Samples, SurfaceData, SurfaceSampler
+from nsm.domains import Surface
 from nsm.energies.overfit import NORMAL_FLOOR, normal, position
 from nsm.maps import NeuralMap, SplineGrid
 from nsm.maps.encodings import value_and_jacobian_stack
 from nsm.tasks import Overfit
 from nsm.tasks.optimizers import MuonBesideAdam, build_optimizer
+from nsm.tasks.schedules import scheduled
 
 
 class Candidate(Overfit):

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nsm.domains import Surface
 from rich.console import Console
 from training import MESHES, Clock, OnTheClock, surface_of, train
 

@@ -16,6 +16,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
+
+import nsm
 from nsm.domains import Disc, Keys
 from nsm.domains.common_seams import (
     aligned_keys,
@@ -24,9 +27,6 @@ from nsm.domains.common_seams import (
     edge_lengths,
 )
 from nsm.domains.joint_preparation import common_fractions
-from scipy.spatial import cKDTree
-
-import nsm
 from nsm.results import by_file_vertex
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths

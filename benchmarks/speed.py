@@ -23,8 +23,6 @@ import numpy as np
 import published
 import scale
 import torch
-from nsm.domains import Surface
-from nsm.domains.surface import as_it_lies
 from omegaconf import DictConfig
 from torch import Tensor, nn
 from training import module_of, samples_of
@@ -32,6 +30,8 @@ from training import module_of, samples_of
 import nsm
 from nsm.config import compose_config
 from nsm.data import Samples, SurfaceData
+from nsm.domains import Surface
+from nsm.domains.surface import as_it_lies
 from nsm.energies.overfit import normal, position
 from nsm.maps import NeuralMap, batched
 from nsm.maps.encodings import Identity

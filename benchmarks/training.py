@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
-from nsm.domains import Surface
 from omegaconf import DictConfig
 from pytorch_lightning.callbacks import Callback
 from rich.console import Console
 
 from nsm.data import SurfaceData
+from nsm.domains import Surface
 from nsm.instantiation import made
 from nsm.pipeline import built, make_task
 from nsm.tasks import Overfit

@@ -14,7 +14,8 @@ import trimesh
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
-from nsm.maps import Rotated, build_planar
+from nsm.maps import DiscMap, NeuralMap, Rotated
+from nsm.maps.activations import Tanh
 from nsm.results import (
     NeuralSurface,
     Parameterization,
@@ -30,14 +31,13 @@ from nsm.results.view.scene import PLAIN, POSITION, UP_AXES, Paint, scene_of
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import boundary_loops
 
-NETWORK = {"width": 4, "depth": 1, "activation": {"name": "tanh"}, "onto": "disc"}
-
 
 def turned(angle: float) -> Rotated:
     """The rotation of the disc by an angle: a network starts as the identity."""
     c, s = np.cos(angle), np.sin(angle)
     rotation = torch.tensor([[c, -s], [s, c]], dtype=torch.float32)
-    return Rotated(build_planar(NETWORK), rotation).eval().requires_grad_(False)
+    h = DiscMap(NeuralMap(DiscMap.network_out_dim, width=4, depth=1, activation=Tanh()))
+    return Rotated(h, rotation).eval().requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
