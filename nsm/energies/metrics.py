@@ -1,8 +1,8 @@
 """Metrics of Ω, and the two numbers that every distortion of a map between surfaces needs.
 
 With A the metric that the source surface induces on Ω and B the target's, the differential J_f
-of the map satisfies J_fᵀJ_f ~ A⁻¹B (similar matrices), so trace and determinant of A⁻¹B tell
-both singular values, and no tangent frame is needed.
+of the map satisfies J_fᵀJ_f ~ A⁻¹B (similar matrices), so trace and determinant of A⁻¹B give
+both singular values without a tangent frame.
 """
 
 from __future__ import annotations

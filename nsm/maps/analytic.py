@@ -117,7 +117,7 @@ class Plane(AnalyticSurface):
 class SphereCap(AnalyticSurface):
     """The part of the unit sphere within ``angle`` of its pole, by stereographic projection.
 
-    Conformal, and smooth on the whole plane, so that points astray outside Ω do no harm. With the
+    Conformal, and smooth on the whole plane, so that points outside Ω do no harm. With the
     default angle and area the radius is 1.
 
     Args:
@@ -298,7 +298,7 @@ class Formula(AnalyticSurface):
 
     Args:
         name: of the surface.
-        function: u (N,), v (N,) and parameters to three coordinates (N,), each point's of its own
+        function: u (N,), v (N,) and parameters to three coordinates (N,), each from its own
             u and v alone; finite and smooth on the closed disc.
         **parameters: of the function.
 
@@ -337,11 +337,11 @@ def build_analytic(config: Mapping[str, Any], trust: Iterable[str] = ()) -> Anal
     Args:
         config: ``{"name": ..., parameters}``, or ``AnalyticSurface.config``, whose ``_target_`` is
             a class.
-        trust: modules beside nsm that this class may come from.
+        trust: modules other than nsm that this class may come from.
 
     Raises:
-        NsmError: the name or a parameter is not known, is missing, or has no good value.
-        NotTrusted: the class is not nsm's, nor of these modules.
+        NsmError: the name or a parameter is not known, is missing, or is out of range.
+        NotTrusted: the class is in another module.
     """
     parameters = dict(config)
     target = parameters.pop("_target_", None)

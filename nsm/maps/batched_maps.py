@@ -1,6 +1,6 @@
-"""Several maps evaluated in one batch, each at points of its own.
+"""Several maps evaluated in one batch, each at its own points.
 
-A device with room for more work than one small network then does that of all at the cost of one.
+On a device that one small network does not fill, k networks then cost about as much as one.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
 from nsm.maps.planar import IdentityInitializedMap
 
 
-class Alike(nn.Module):
-    """k networks with the same configuration, whose weights stay their own.
+class BatchedNetworks(nn.Module):
+    """k networks of the same configuration, each with its own weights.
 
     Args:
         networks: k of them.
@@ -66,7 +66,7 @@ class Alike(nn.Module):
 
 
 class OneByOne(nn.Module):
-    """k maps that are not alike, evaluated one after the other.
+    """k maps of any kind, evaluated one after the other.
 
     Args:
         maps: k of them, with images of one dimension.
@@ -91,17 +91,16 @@ class OneByOne(nn.Module):
 
 
 def batched(maps: Sequence[nn.Module]) -> Any:
-    """One map of points (k, N, 2), N for each of k maps, that does what they do.
+    """One map of points (k, N, 2), N for each of k maps.
 
-    Networks, planar maps and rotated ones that are alike but for their weights are evaluated in
-    one batch; any others one after the other. The weights stay their own, and gradients go to
-    them.
+    Networks, planar maps and rotated ones that differ in their weights alone are evaluated in one
+    batch; any others one after the other. Gradients go to the weights of each.
 
     Args:
         maps: k of them, with images of one dimension.
 
     Returns:
-        A module with ``value_and_jacobian``, as each of them.
+        A module with ``value_and_jacobian``.
     """
     first = maps[0]
     if all(isinstance(m, Rotated) for m in maps):
@@ -109,10 +108,10 @@ def batched(maps: Sequence[nn.Module]) -> Any:
         return Rotated.all_of(turned, batched([m.inner for m in turned]))
     if all(type(m) is type(first) for m in maps):
         if isinstance(first, IdentityInitializedMap):
-            networks = [cast(IdentityInitializedMap, m).network for m in maps]
-            return type(first).around(batched(networks))
+            inner = [cast(IdentityInitializedMap, m).network for m in maps]
+            return type(first).around(batched(inner))
         if isinstance(first, NeuralMap) and first.fused:
-            alike = cast(Sequence[NeuralMap], maps)
-            if all(m.config == first.config for m in alike):
-                return Alike(alike)
+            networks = cast(Sequence[NeuralMap], maps)
+            if all(m.config == first.config for m in networks):
+                return BatchedNetworks(networks)
     return OneByOne(maps)

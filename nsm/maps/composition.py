@@ -1,4 +1,4 @@
-"""Maps made of maps, with Jacobians by the chain rule."""
+"""Composed maps, with Jacobians by the chain rule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 
 class PointMap(Protocol):
-    """What a map answers: values, and values with Jacobians."""
+    """A map: values, and values with Jacobians."""
 
     def __call__(self, x: Tensor) -> Tensor: ...
 
@@ -66,7 +66,7 @@ class Rotated(nn.Module):
 
     @classmethod
     def all_of(cls, turned: Sequence[Rotated], inner: nn.Module) -> Rotated:
-        """k such maps as one: ``inner`` does what theirs do, of points (k, N, 2)."""
+        """k such maps as one of points (k, N, 2), around a batch of their inner maps."""
         made = cls.__new__(cls)
         nn.Module.__init__(made)
         made.inner = inner

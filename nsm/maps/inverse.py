@@ -1,4 +1,4 @@
-"""Planar maps the other way round: h⁻¹, found by Newton's method."""
+"""Inverses h⁻¹ of planar maps, by Newton's method."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def inverted(
 ) -> Tensor:
     """Points x (N, 2) with h(x) = targets (N, 2), by damped Newton steps from start (N, 2).
 
-    A step that would not come nearer is halved; where none helps, the point stays as it is, so
-    that the result is never farther off than the start.
+    A step that does not come nearer is halved; where none does, the point stays, so that the
+    result is never farther off than the start.
 
     Args:
         h: a planar map with ``value_and_jacobian``, injective near the points.
@@ -56,7 +56,7 @@ def inverted(
             moved[left[now]] = True
             left = left[~now]
             step[left] *= _SHRINK
-        moving = moving[moved]  # one that no step helps would only try the same again
+        moving = moving[moved]  # the others would only try the same steps again
         if len(moving) == 0:
             break
     return x

@@ -1,8 +1,8 @@
 """The layers of a network as one differentiable operation on values and tangents.
 
 A stack (P, N, d) holds the values of N points and, below them, their P − 1 tangents. A layer is
-one matrix product for all of its planes. The backward pass is written out: plain autograd keeps
-several times as much, and makes many small operations of each layer.
+one matrix product for all of its planes. The backward pass is written by hand: plain autograd
+stores several times as much, and runs many small operations for each layer.
 
 Networks of one architecture can be evaluated in one batch: stacks are then (k, P, N, d), weights
 (k, d, d') and biases (k, d).
@@ -19,8 +19,8 @@ from torch.autograd.function import once_differentiable
 
 from nsm.maps.activations import Activation
 
-# Entries of a stack that are worked on at once on a CPU: the operations behind a matrix product
-# then find its result in the cache.
+# Entries of a stack that a CPU processes at once: the operations after a matrix product then find
+# its result in the cache.
 _AT_ONCE = 192 * 1024
 
 
@@ -28,8 +28,8 @@ class MLPWithTangents(torch.autograd.Function):
     """Hidden layers a_k = act(z_k), z_k = W_k a_{k−1} + b_k + r_k, and an output layer without act.
 
     r_k is zero but in every second hidden layer (k = 2, 4, ...), where it is a_{k−2} for
-    ``skip="post"`` and z_{k−2} for ``skip="pre"``. The backward pass can not be differentiated
-    once more. Frozen parameters cost no work in it, and what only they would need is not kept.
+    ``skip="post"`` and z_{k−2} for ``skip="pre"``. The backward pass cannot be differentiated
+    again. It skips frozen parameters, and what only they would need is not stored.
     """
 
     @staticmethod
@@ -77,7 +77,7 @@ class MLPWithTangents(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         layers = (len(ctx.needs_input_grad) - 4) // 2
-        saved = ctx.saved_tensors  # once: checkpointed parts are computed anew by this
+        saved = ctx.saved_tensors  # read once: checkpointing recomputes them here
         parameters, tape = saved[: 2 * layers], saved[2 * layers :]
         weights = parameters[::2]
         of_stack = gradient.new_empty(ctx.shape) if ctx.needs_input_grad[0] else None
@@ -87,7 +87,7 @@ class MLPWithTangents(torch.autograd.Function):
         for number, rows in enumerate(chunks):
             first = number * (1 + stride * (layers - 1))
             g = gradient[..., rows, :].contiguous()
-            carried: Tensor | None = None  # the gradient on its way past two layers
+            carried: Tensor | None = None  # the gradient that skips two layers
             for k in range(layers - 1, -1, -1):
                 at = first + 1 + stride * k
                 joins = ctx.skip is not None and k % 2 == 0
@@ -119,7 +119,7 @@ def _planes(stack: Tensor) -> Tensor:
 
 
 def _chunks(shape: torch.Size, weight: Tensor) -> list[slice]:
-    """Equal parts of a stack's points; one where the device has no use for small ones."""
+    """Equal parts of a stack's points; a single one unless on a CPU."""
     count, parts = shape[-2], 1
     if weight.device.type == "cpu":
         entries = math.prod(shape[:-1]) * weight.shape[-2]
@@ -145,7 +145,7 @@ def _added(to: Tensor, a: Tensor, b: Tensor, out: Tensor | None = None) -> Tenso
 
 
 def _back(g: Tensor, weight: Tensor, carried: Tensor | None) -> Tensor:
-    """The gradient by a layer's input; what is carried past it is added in its place."""
+    """The gradient by a layer's input, plus what is carried past the layer, in its memory."""
     rows = g.flatten(-3, -2)
     if carried is None:
         return (rows @ weight).view(*g.shape[:-1], weight.shape[-1])

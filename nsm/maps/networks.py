@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsm.instantiation import check_trusted, made, made_with
+from nsm.instantiation import check_trusted, made, made_with, target_of
 from nsm.maps.activations import Activation, Softplus, as_activation
 from nsm.maps.encodings import (
     Identity,
@@ -46,7 +46,7 @@ class PreActivationBlock(nn.Module):
 
 
 class DenseBlock(nn.Module):
-    """act(L x): one layer of a plain multi-layer perceptron."""
+    """act(L x): one layer of a multi-layer perceptron."""
 
     def __init__(self, width: int, activation: Activation) -> None:
         super().__init__()
@@ -56,14 +56,13 @@ class DenseBlock(nn.Module):
         return self.activation(self.linear(x))
 
 
-# from the features and the activation to a module (N, width) to (N, width)
+# from width and activation to a module (N, width) to (N, width)
 BLOCKS: dict[str, Callable[[int, Activation], nn.Module]] = {
     "plain": DenseBlock,
     "post": PostActivationBlock,
     "pre": PreActivationBlock,
 }
-# what every second layer adds (see :class:`nsm.maps.mlp_with_tangents.MLPWithTangents`), of the
-# blocks whose layers that operation knows
+# the ``skip`` of :class:`nsm.maps.mlp_with_tangents.MLPWithTangents`, for the blocks that it covers
 SKIPS = {"plain": None, "post": "post", "pre": "pre"}
 INITIALIZATIONS = ("xavier", "kaiming", "siren")
 # what the features of a point add to the output past the network: nothing, or a linear function;
@@ -118,7 +117,7 @@ class NeuralMap(nn.Module):
         self.encoding = as_encoding(Identity() if encoding is None else encoding)
         self.activation = as_activation(Softplus() if activation is None else activation)
         self.config: dict[str, Any] = {
-            "_target_": "nsm.maps.NeuralMap",
+            "_target_": target_of(type(self)).replace("nsm.maps.networks.", "nsm.maps."),
             "out_dim": out_dim,
             "width": width,
             "depth": depth,
@@ -238,7 +237,7 @@ def build_network(
     encoding: Mapping[str, Any] | None = None,
     out_dim: int = 3,
 ) -> nn.Module:
-    """The network that plain settings name, each part with the ``config`` it was made from.
+    """The network that plain settings name; it and its parts record them as ``config``.
 
     Args:
         map: with ``_target_``, :class:`NeuralMap` by default; a class of the user's gets
@@ -263,7 +262,7 @@ def build_network(
     network: nn.Module = made_with(settings, out_dim=out_dim, **parts)
     if not hasattr(network, "value_and_jacobian"):
         network = ForeignMap(network)
-    if not hasattr(network, "config"):
+    if type(network) is not NeuralMap:
         configs = {key: part.config for key, part in parts.items()}
         network.config = {**settings, "out_dim": out_dim, **configs}  # type: ignore[assignment]
     return network
@@ -274,10 +273,10 @@ def build_stored(config: Mapping[str, Any], trust: Iterable[str] = ()) -> nn.Mod
 
     Args:
         config: ``config`` of a map that :func:`build_network` made, or of a planar map around one.
-        trust: modules beside nsm and torch from which to make objects.
+        trust: modules other than nsm and torch from which to make objects.
 
     Raises:
-        NotTrusted: a target outside nsm, torch and these modules.
+        NotTrusted: a target in any other module.
         NsmError: a target cannot be imported or refuses its settings.
     """
     check_trusted(config, trust)

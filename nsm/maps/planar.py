@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.errors import NsmError
+from nsm.instantiation import target_of
 
 
 class IdentityInitializedMap(nn.Module):
@@ -48,7 +49,7 @@ class IdentityInitializedMap(nn.Module):
 
     @classmethod
     def around(cls, network: nn.Module) -> Self:
-        """The map of a network as it is, which also may be several in one batch."""
+        """The map around a network that is left as it is, or around a batch of networks."""
         made = cls.__new__(cls)
         nn.Module.__init__(made)
         made.network = network
@@ -56,7 +57,8 @@ class IdentityInitializedMap(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        return {"_target_": f"nsm.maps.{type(self).__name__}", "network": self.network.config}
+        target = target_of(type(self)).replace("nsm.maps.planar.", "nsm.maps.")
+        return {"_target_": target, "network": self.network.config}
 
 
 class PlanarMap(IdentityInitializedMap):
@@ -120,5 +122,5 @@ class SquareMap(IdentityInitializedMap):
 
 
 def _turned(y: Tensor, c: Tensor, s: Tensor) -> Tensor:
-    """y (..., 2) turned by the angles whose cosine and sine (...) are given."""
+    """y (..., 2) rotated by the angles with cosine c and sine s (...)."""
     return torch.stack([c * y[..., 0] - s * y[..., 1], s * y[..., 0] + c * y[..., 1]], dim=-1)

@@ -49,14 +49,39 @@ def polar_area(surface):
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
-def test_jacobian_agrees_with_automatic_differentiation(config):
-    surface = build_analytic(config)
-    x = disc_points()
+def test_jacobian_agrees_with_finite_differences(config):
+    surface, x, step = build_analytic(config), disc_points(), 1e-5
     value, jacobian = surface.value_and_jacobian(x)
-    expected = torch.vmap(torch.func.jacfwd(lambda p: surface(p[None])[0]))(x)
+    ends = [
+        (surface(x + d) - surface(x - d)) / (2 * step)
+        for d in step * torch.eye(2, dtype=x.dtype)[:, None]
+    ]
     assert value.shape == (200, 3)
-    torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-10)
+    torch.testing.assert_close(jacobian, torch.stack(ends, dim=-1), rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(surface(x), value, rtol=0, atol=0)
+    one_by_one = torch.vmap(lambda p: tuple(t[0] for t in surface.value_and_jacobian(p[None])))(x)
+    torch.testing.assert_close(one_by_one, (value, jacobian))
+
+
+CLOSED_FORMS = {
+    "plane": lambda u, v: [[1, 0], [0, 1], [0, 0]],
+    "cylinder": lambda u, v: [[math.cos(u / 0.6), 0], [0, 1], [-math.sin(u / 0.6), 0]],
+    "paraboloid": lambda u, v: [[1, 0], [0, 1], [u, v]],
+    "saddle": lambda u, v: [[1, 0], [0, 1], [u, -v]],
+    "cone": lambda u, v: [[1, 0], [0, 1], [-w / math.hypot(u, v, 0.05) for w in (u, v)]],
+    "torus_patch": lambda u, v: [
+        [-(1 + 0.4 * math.cos(2 * v)) * math.sin(u), -0.8 * math.sin(2 * v) * math.cos(u)],
+        [(1 + 0.4 * math.cos(2 * v)) * math.cos(u), -0.8 * math.sin(2 * v) * math.sin(u)],
+        [0, 0.8 * math.cos(2 * v)],
+    ],
+}
+
+
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_jacobian_has_its_closed_form(name):
+    surface, x = build_analytic({"name": name, "area": None}), disc_points(20)
+    wanted = torch.tensor([CLOSED_FORMS[name](*p) for p in x.tolist()], dtype=x.dtype)
+    torch.testing.assert_close(surface.value_and_jacobian(x)[1], wanted, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
@@ -248,28 +273,31 @@ def test_any_text_is_a_graph_or_a_plain_refusal(text):
 
 
 @pytest.mark.parametrize(
-    ("config", "words"),
+    ("config", "kind", "key"),
     [
-        ({"name": "sphere"}, "sphere_cap"),
-        ({}, "known are"),
-        ({"name": "plane", "colour": 1}, "colour"),
-        ({"name": "graph"}, "'z'"),
-        ({"name": "graph", "z": None}, "expression"),
-        ({"name": "sphere_cap", "angle": 4.0}, "pi"),
-        ({"name": "cylinder", "radius": 0.1}, "1/pi"),
-        ({"name": "cone", "tip": 0.0}, "tip"),
-        ({"name": "cone", "tip": 1e200}, "cone"),
-        ({"name": "cone", "slope": math.nan}, "finite"),
-        ({"name": "torus_patch", "minor": 1.5}, "minor"),
-        ({"name": "torus_patch", "sweep": 4.0}, "sweep"),
-        ({"name": "torus_patch", "tube": 0.0}, "tube"),
-        ({"name": "mobius_graph", "width": 2}, "width"),
-        ({"name": "mobius_graph", "sweep": -1}, "sweep"),
-        ({"name": "saddle", "curvature": "steep"}, "steep"),
-        ({"name": "plane", "area": -1}, "area"),
-        ({"name": "plane", "area": math.inf}, "area"),
+        ({"name": "sphere"}, "unknown_option", "name"),
+        ({}, "unknown_option", "name"),
+        ({"name": "plane", "colour": 1}, "unknown_setting", "plane"),
+        ({"name": "graph"}, "unknown_setting", "graph"),
+        ({"name": "graph", "z": None}, "out_of_range", "z"),
+        ({"name": "sphere_cap", "angle": 4.0}, "out_of_range", "angle"),
+        ({"name": "cylinder", "radius": 0.1}, "out_of_range", "radius"),
+        ({"name": "cone", "tip": 0.0}, "out_of_range", "tip"),
+        ({"name": "cone", "tip": 1e200}, "wrong_type", "cone"),
+        ({"name": "cone", "slope": math.nan}, "not_finite", "cone"),
+        ({"name": "torus_patch", "minor": 1.5}, "out_of_range", "minor"),
+        ({"name": "torus_patch", "sweep": 4.0}, "out_of_range", "sweep"),
+        ({"name": "torus_patch", "tube": 0.0}, "out_of_range", "tube"),
+        ({"name": "mobius_graph", "width": 2}, "out_of_range", "width"),
+        ({"name": "mobius_graph", "sweep": -1}, "out_of_range", "sweep"),
+        ({"name": "saddle", "curvature": "steep"}, "wrong_type", "saddle"),
+        ({"name": "plane", "area": -1}, "out_of_range", "area"),
+        ({"name": "plane", "area": math.inf}, "out_of_range", "area"),
+        ({"_target_": "nsm.maps.NeuralMap"}, "wrong_type", "nsm.maps.NeuralMap"),
+        ({"_target_": "os.getcwd"}, "not_trusted", "os"),
     ],
 )
-def test_bad_settings_are_named(config, words):
-    with pytest.raises(NsmError, match=words):
+def test_bad_settings_are_refused(config, kind, key):
+    with pytest.raises(NsmError) as error:
         build_analytic(config)
+    assert (error.value.kind, error.value.key) == (kind, key)

@@ -10,7 +10,7 @@ from map_samples import activation, encoding, network, planar
 from torch import Tensor
 
 from nsm.maps import Composition, Rotated, batched, build_analytic
-from nsm.maps.batched_maps import Alike, OneByOne
+from nsm.maps.batched_maps import BatchedNetworks, OneByOne
 
 GRID = encoding("SplineGrid", resolutions=[4, 16], features=3)
 NETWORKS: list[dict[str, Any]] = [
@@ -61,7 +61,7 @@ def check(maps: list[Any], count: int = 37) -> None:
 @pytest.mark.parametrize("settings", NETWORKS)
 def test_networks(settings):
     maps = several(settings)
-    assert isinstance(batched(maps), Alike)
+    assert isinstance(batched(maps), BatchedNetworks)
     check(maps)
 
 
