@@ -123,7 +123,7 @@ def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, 
             result[k] = value
         elif k in known:
             result[k] = _fit(dotted, value, known[k])
-        elif others:
+        elif others and (dotted in given or not retargeted):
             result[k] = _nested(dotted, value)
         elif dotted in given or not (retargeted or dotted in _FROM_INITIALIZATION):
             raise unknown_setting(dotted, list(known), name)
@@ -147,6 +147,8 @@ def takes(group: str, thing: Any) -> tuple[dict[str, Parameter], bool]:
     nsm's own classes name all that they take, though a base of theirs may accept others.
     """
     known, others = parameters(thing)
+    if getattr(thing, "__init__", None) is torch.nn.Module.__init__:  # which takes nothing
+        others = False
     others = others and not str(thing.__module__).startswith("nsm.")
     supplied = SUPPLIED.get(group, ())
     return {k: p for k, p in known.items() if k not in supplied} | EXTRA.get(group, {}), others

@@ -292,6 +292,7 @@ def test_a_mistake_names_the_nearest():
         ("optimizer.weight_decay=1", "optimizer.weight_decay", 1.0),
         ("+optimizer.weight_decay=1", "optimizer.weight_decay", 1.0),
         ("activation._target_=torch.nn.Mish", "activation.beta", None),
+        ("activation._target_=torch.nn.Tanh", "activation.beta", None),
         ("activation._target_=torch.nn.CELU activation.alpha=2", "activation.alpha", 2.0),
         (
             "scheduler._target_=torch.optim.lr_scheduler.StepLR scheduler.step_size=5",

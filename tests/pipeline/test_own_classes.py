@@ -1,5 +1,6 @@
 """A user's own classes in a run: named by ``_target_``, without a line of nsm's."""
 
+import csv
 import json
 
 import pytest
@@ -92,19 +93,11 @@ class MyTerm:
 
 
 def test_a_loss_term(surface, tmp_path):
-    words = [
-        "logger=csv",
-        f"+loss_terms.mine._target_={HERE}.MyTerm",
-        "+loss_terms.mine.weight=0.5",
-    ]
-    run(surface, tmp_path, *words, "+loss_terms.mine.power=1.0")
+    words = [f"+loss_terms.mine._target_={HERE}.MyTerm", "+loss_terms.mine.weight=0.5"]
+    run(surface, tmp_path, *words, "+loss_terms.mine.power=1.0", "logger=csv")
     assert SEEN[0].uv.shape == (64, 2) and SEEN[0].target.shape == (64, 2, 2)
-    rows = (tmp_path / "csv" / "metrics.csv").read_text().splitlines()
-    first = next(
-        r
-        for r in (dict(zip(rows[0].split(","), x.split(","), strict=True)) for x in rows[1:])
-        if r["train/loss"]
-    )
+    with (tmp_path / "csv" / "metrics.csv").open() as stream:
+        first = next(row for row in csv.DictReader(stream) if row["train/loss"])
     weighted = [float(v) for k, v in first.items() if k.startswith("weighted/") and v]
     assert len(weighted) == 3 and sum(weighted) == pytest.approx(float(first["train/loss"]))
     assert float(first["weighted/mine"]) == pytest.approx(0.5 * float(first["train/mine"]))
