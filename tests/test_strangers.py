@@ -131,7 +131,7 @@ def test_pipes_are_not_waited_for(copy):
     for load, file in ((nsm.load, copy), (read_landmarks, copy / "marks.vts")):
         with pytest.raises(NsmError) as refused:
             load(file)
-        assert refused.value.kind == "unreadable_file"
+        assert refused.value.kind == "not_a_file"
 
 
 @pytest.mark.parametrize(
@@ -393,7 +393,7 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "mesh.obj")
     with pytest.raises(NsmError) as refused:
         load_mesh(tmp_path / "mesh.obj")
-    assert refused.value.kind == "unreadable_file"
+    assert refused.value.kind == "not_a_file"
 
 
 def test_an_array_that_lies_makes_no_room(tmp_path):

@@ -66,9 +66,10 @@ class SurfaceCollection:
             names.append(next(n for n in candidates if n not in names))
         return names
 
-    def pair_name(self, source: int, target: int) -> str:
-        """The name of an ordered pair, "SOURCE → TARGET"."""
-        return f"{self.names[source]} → {self.names[target]}"
+    @cached_property
+    def pair_names(self) -> dict[tuple[int, int], str]:
+        """Names of the ordered pairs, "SOURCE → TARGET"."""
+        return {(i, j): f"{self.names[i]} → {self.names[j]}" for i, j in self._ordered}
 
     def pair(self, source: int, target: int) -> SurfaceMap:
         """The map F_{source→target} from any surface to any other, by number.
@@ -199,7 +200,7 @@ def collection_metrics(
         s, t = f.source.surface, f.target.surface
         landed = f.planar(targets[i]) if len(points) else points
         own = pair_metrics(s, t, f.image_uv, landed, targets[j])
-        pairs[collection.pair_name(i, j)] = {**own, **f.certificate}
+        pairs[collection.pair_names[i, j]] = {**own, **f.certificate}
     figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
     cycles = list(itertools.permutations(range(len(collection)), 3))
     cycles = cycles[:: -(-len(cycles) // _MOST_CYCLES)]
