@@ -18,7 +18,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from nsm.errors import NotTrusted, NsmError
+from nsm.errors import NotRegistered, NotTrusted, NsmError
 
 # packages and modules whose classes only compute: making one reads and writes no file; loggers get
 # their folder from the run
@@ -127,6 +127,7 @@ def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
     Raises:
         NotTrusted: a target that :func:`is_trusted` refuses, anywhere within; a logger that names
             its folder, or any positional arguments.
+        NotRegistered: a registered object that this process does not know.
         NsmError: ``interpolation``: a text with ``${``, which could become a target later.
     """
     trust = _modules(trust)
@@ -139,6 +140,9 @@ def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
         target = str(config.get("_target_", ""))
         writes = _within(target, _LOGGERS) and "folder" in config  # anywhere on the disk
         if "_args_" in config or writes or ("_target_" in config and not is_trusted(target, trust)):
+            module, _, name = target.rpartition(".")
+            if module == REGISTERED:
+                raise NotRegistered("object", name, "register_...")
             raise NotTrusted(target)
         for item in config.items():
             check_trusted(item, trust)

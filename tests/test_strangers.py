@@ -260,11 +260,11 @@ def test_a_stored_configuration_makes_nothing_by_target(copy, here):
 
 def test_a_name_is_no_interpolation(tmp_path, here, monkeypatch):
     """A file may be called so; its name must not tell what the environment holds."""
-    monkeypatch.setenv("SECRET", "told")
+    monkeypatch.setenv("SECRET", "hidden")
     (tmp_path / "${oc.env:SECRET}.obj").write_text("v 0 0 0\n")
     result = here('surface.path="\\${oc.env:SECRET}.obj"')
     assert result.returncode == 2
-    assert "told" not in result.stderr
+    assert "hidden" not in result.stderr
 
 
 def changed(folder: Path, **metadata) -> None:

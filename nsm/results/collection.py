@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
 from nsm.maps import PlanarMap, TransitionMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
@@ -106,8 +107,10 @@ class SurfaceCollection:
         first = self.maps[source]
         turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
         nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
-        free = isinstance(first.inner, PlanarMap)
-        project = None if free else self.surfaces[source].surface.domain.project
+        domain = self.surfaces[source].surface.domain
+        project = None
+        if isinstance(domain, BoundedDomain) and not isinstance(first.inner, PlanarMap):
+            project = domain.project
         h = TransitionMap(_double(first), _double(self.maps[target]), nodes, project).eval()
         if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
             uv = torch.as_tensor(self.surfaces[source].surface.uv)
