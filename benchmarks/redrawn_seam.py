@@ -20,12 +20,12 @@ import torch
 from scipy.spatial import cKDTree
 
 import nsm
-from nsm.domains.base import Keys
+from nsm.domains import Disc, Keys
 from nsm.domains.common_seams import (
+    aligned_keys,
     boundary_keys,
     corresponding_paths,
     edge_lengths,
-    turned_alike,
 )
 from nsm.domains.joint_preparation import common_fractions
 from nsm.results import by_file_vertex
@@ -92,12 +92,12 @@ def redrawn(
         cut_along_paths(m.vertices, m.faces, p, name=n)
         for m, p, n in zip(meshes, paths, names, strict=True)
     ]
-    keys = turned_alike(
+    keys = aligned_keys(
         [boundary_keys(cut.origin, cut.loop, v) for cut, v in zip(cuts, ids, strict=True)]
     )
     assert keys is not None
     on_rim = [k[:, 1] for k in keys]
-    fractions = common_fractions(cuts, on_rim, "disc")
+    fractions = common_fractions(cuts, on_rim, Disc())
     return [
         nsm.Surface.from_cut(
             cut,

@@ -424,5 +424,7 @@ def defaults() -> dict[str, Any]:
 
 def parts() -> dict[str, type]:
     """The classes of the nested plain settings by key: surface, phi, trainer, ..."""
-    kinds: dict[str, Any] = {k: parameter.kind for k, parameter in parameters(Settings)[0].items()}
-    return {key: kind for key, kind in kinds.items() if is_dataclass(kind)}
+    kinds = {key: parameter.kind for key, parameter in parameters(Settings)[0].items()}
+    return {
+        key: kind for key, kind in kinds.items() if inspect.isclass(kind) and is_dataclass(kind)
+    }

@@ -1,8 +1,8 @@
-"""Large meshes laid out coarse first: the coarse mesh is solved for, the rest is put back in.
+"""Coarse-to-fine layout of large meshes: embed a decimated mesh, then reinsert the vertices.
 
-Each round of :mod:`nsm.domains.decimation` is undone in the plane without a flip, and what was
-put back, and from time to time everything, is relaxed. Time and memory grow with the mesh alone,
-not with the fill of a factorised matrix.
+Each round of :mod:`nsm.domains.decimation` is undone in the plane without flips. Reinserted
+vertices, and from time to time all vertices, are relaxed. Time and memory grow linearly with the
+mesh, not with the fill of a factorised matrix.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 _GROWTH = 2.0  # of the faces between two sweeps over all vertices
 _SWEEPS = 8
-_STEPS = 3  # of Newton's method on what was put back
-_NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
+_STEPS = 3  # of Newton's method on reinserted vertices
+_NEARER = 0.7  # factor on the distance to the target, each time a vertex does not fit
 _TRIES = 40
 
 
-def laid_out(
+def embed_coarse_to_fine(
     vertices: np.ndarray,
     faces: np.ndarray,
     loop: np.ndarray,
@@ -39,15 +39,15 @@ def laid_out(
     """Coordinates (V, 2) of a disc-shaped mesh (V, 3), (F, 3) that has the domain's area.
 
     Args:
-        loop, boundary: the boundary's vertices (B,), and where the coarse mesh's start (B, 2).
+        loop, boundary: the boundary loop's vertices (B,), and their initial places (B, 2).
         domain: Ω.
-        held: (V,) mask of boundary vertices that stay where ``boundary`` has them.
-        solve: lays out the coarse mesh, without flips; from what is given here of it, the domain
-            aside, to its coordinates.
+        held: (V,) mask of boundary vertices that stay in their initial places.
+        solve: lays out the coarse mesh without flips: from its vertices, faces, loop, boundary and
+            held to its coordinates.
         count: faces of the coarse mesh.
 
     Returns:
-        None if a vertex finds no place without a flip, for lack of digits.
+        None if rounding leaves a vertex no place without a flip.
     """
     current, rounds = coarsen(vertices, faces, held, count)
     coarse = present_faces(current)
@@ -55,15 +55,15 @@ def laid_out(
     left = np.isin(loop, ids)
     area = topology.face_areas(vertices, faces).sum() / topology.face_areas(vertices, coarse).sum()
     uv = np.zeros((len(vertices), 2))
-    points, rim_left = vertices[ids] * np.sqrt(area), local[loop[left]]
-    uv[ids] = solve(points, local[coarse], rim_left, boundary[left], held[ids])
-    rim = np.zeros(len(vertices), dtype=bool)
-    rim[loop] = True
-    freedom = Freedom(rim, held, domain)
+    points, coarse_loop = vertices[ids] * np.sqrt(area), local[loop[left]]
+    uv[ids] = solve(points, local[coarse], coarse_loop, boundary[left], held[ids])
+    on_boundary = np.zeros(len(vertices), dtype=bool)
+    on_boundary[loop] = True
+    freedom = Freedom(on_boundary, held, domain)
     swept = len(coarse)
     for step in reversed(rounds):
         undo(current, step)
-        if not _put_back(vertices, current, uv, freedom, step):
+        if not _reinsert(vertices, current, uv, freedom, step):
             return None
         present = present_faces(current)
         if len(present) >= _GROWTH * swept or step is rounds[0]:
@@ -72,10 +72,10 @@ def laid_out(
     return uv
 
 
-def _put_back(
+def _reinsert(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, freedom: Freedom, step: Round
 ) -> bool:
-    """Give a round's vertices places in uv (V, 2) that flip no triangle; whether that was done."""
+    """Place a round's vertices in uv (V, 2) without flips; whether all found a place."""
     face, k = step.corners // 3, step.corners % 3
     b, c = faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]
     stars = Stars.of(vertices, step.vertex, step.star, b, c)
@@ -84,8 +84,8 @@ def _put_back(
     place[inner] = _mean_values(vertices, uv, stars)[inner]
     place[~inner] = _between(vertices, uv, freedom, step, ~inner)
     fits = _placed(uv, stars, step, place, freedom)
-    # near the target there is always room, but not in every direction
-    left, step_left = stars.chosen(~fits), step.chosen(~fits)
+    # near the target there is always room, though not in every direction
+    left, step_left = stars.subset(~fits), step.subset(~fits)
     if (
         len(left.vertex)
         and not _placed(
@@ -101,28 +101,28 @@ def _put_back(
 def _placed(
     uv: np.ndarray, stars: Stars, step: Round, place: np.ndarray, freedom: Freedom
 ) -> np.ndarray:
-    """Move each star's vertex to its place (N, 2), or as near to it from its target as it flips
-    nothing; mask (N,) of those that found a place."""
+    """Move each star's vertex to its place (N, 2), or from there towards its target until nothing
+    flips; mask (N,) of the vertices that found a place."""
     found = np.zeros(len(place), dtype=bool)
     missing, share = np.arange(len(place)), 1.0
     for _ in range(_TRIES):
         if len(missing) == 0:
             break
-        target, rim = uv[step.target[missing]], step.before[missing] >= 0
+        target, on_boundary = uv[step.target[missing]], step.before[missing] >= 0
         trial = target + share * (place[missing] - target)
-        trial = _on_rim(trial, target, place[missing], rim, freedom)
+        trial = _retracted(trial, target, place[missing], on_boundary, freedom)
         fits = np.isfinite(stars.energy(uv, trial))
         uv[stars.vertex[fits]] = trial[fits]
         found[missing[fits]] = True
-        stars, missing = stars.chosen(~fits), missing[~fits]
+        stars, missing = stars.subset(~fits), missing[~fits]
         share *= _NEARER
     return found
 
 
 def _inwards(uv: np.ndarray, stars: Stars, step: Round, place: np.ndarray) -> np.ndarray:
-    """Places (N, 2) as far from their targets as the given ones, but between the sides there.
+    """Places (N, 2) as far from their targets as the given ones, but between the star's sides.
 
-    Of a vertex on the boundary, the given ones.
+    Boundary vertices keep the given ones.
     """
     target = step.target[stars.star]
     left = np.zeros((len(place), 2))
@@ -164,9 +164,9 @@ def _between(
     return uv[w] + share * (uv[a] - uv[w])
 
 
-def _on_rim(
-    trial: np.ndarray, one: np.ndarray, other: np.ndarray, rim: np.ndarray, freedom: Freedom
+def _retracted(
+    trial: np.ndarray, one: np.ndarray, other: np.ndarray, on_boundary: np.ndarray, freedom: Freedom
 ) -> np.ndarray:
-    """Points of chords (N, 2), those of a mask brought to ∂Ω; a side of the square is kept to."""
-    same = rim[:, None] & (one == other)
-    return freedom.retract(np.where(same, one, trial), rim)
+    """Points of chords (N, 2), those of a mask moved to ∂Ω along the sides they are on."""
+    same = on_boundary[:, None] & (one == other)
+    return freedom.retract(np.where(same, one, trial), on_boundary)

@@ -1,9 +1,9 @@
-"""Seams that correspond: closed shapes cut through their landmarks, all in the same way.
+"""Corresponding seams: closed shapes cut through their landmarks along the same tree.
 
-The seam is a tree whose nodes are landmarks and whose branches are shortest paths on each mesh.
-Branches meet at landmarks only, and leave each landmark in the same cyclic order on every mesh:
-then the walk around the seam passes the landmarks in the same order everywhere, and a map of one
-disc to another that keeps to that order is a map of the closed shapes.
+The nodes of the tree are landmarks, its branches shortest paths on each mesh. Branches meet only at
+landmarks and leave each landmark in the same cyclic order on every mesh. The walk around the seam
+then passes the landmarks in the same order everywhere, and a map between the discs that keeps this
+order is a map of the closed shapes.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.geometry import ambient_occlusion
 
-# A sector at a landmark: the branch after which, counter-clockwise, it comes; -1 with no branch.
+# A sector at a landmark is named by the branch before it, counter-clockwise; -1 without branches.
 _WHOLE = -1
 
 
 @dataclass
 class _Tracer:
-    """Paths on one closed mesh (V, 3), (F, 3) between landmarks (L,), disjoint but for ends."""
+    """Paths on one closed mesh (V, 3), (F, 3) between landmarks (L,), disjoint except for ends."""
 
     vertices: np.ndarray
     faces: np.ndarray
     landmarks: np.ndarray
-    cost: np.ndarray  # (E,) of walking along each edge
+    cost: np.ndarray  # (E,) of each edge
     # per landmark: the branch number of each first vertex on the way out
     spokes: list[dict[int, int]] = field(init=False)
 
@@ -44,7 +44,7 @@ class _Tracer:
         self.rings = [_ring(self.faces, int(v)) for v in self.landmarks]
 
     def distances(self) -> np.ndarray:
-        """(L, L) costs of the cheapest paths between landmarks, were nothing in the way."""
+        """(L, L) costs of the cheapest paths between landmarks, ignoring branches."""
         n = len(self.vertices)
         graph = csr_matrix((self.cost, tuple(self.edges.T)), shape=(n, n))
         return dijkstra(graph, directed=False, indices=self.landmarks)[:, self.landmarks]
@@ -92,8 +92,8 @@ class _Tracer:
             path.append(int(before[path[-1]]))
         return float(distance[b]), path[::-1]
 
-    def lay(self, branch: int, i: int, j: int, path: list[int]) -> None:
-        """Take a path as a branch of the seam."""
+    def add(self, branch: int, i: int, j: int, path: list[int]) -> None:
+        """Add a path to the seam as a branch."""
         self.taken[path] = True
         self.spokes[i][path[1]] = branch
         self.spokes[j][path[-2]] = branch
@@ -123,8 +123,7 @@ def corresponding_paths(
     Args:
         meshes: closed genus-0 manifolds, (V, 3) and (F, 3) each.
         landmarks: (L,) different vertices of each mesh, L at least 2, in the same order.
-        costs: what walking along each edge (of :func:`topology.edges_of`) costs; its length by
-            default.
+        costs: (E,) of each edge of :func:`topology.edges_of`, per mesh; by default its length.
         avoid: further vertices of each mesh that no branch may touch.
 
     Returns:
@@ -154,10 +153,10 @@ def corresponding_paths(
         if not np.isfinite(total):
             continue
         if queue and total > queue[0][0] + 1e-12:
-            heapq.heappush(queue, (total, i, j))  # others may have become the shorter ones
+            heapq.heappush(queue, (total, i, j))  # others may be shorter now
             continue
         for tracer, laid, path in zip(tracers, branches, paths, strict=True):
-            tracer.lay(len(laid), i, j, path)
+            tracer.add(len(laid), i, j, path)
             laid.append(path)
         old, new = component[j], component[i]
         component = [new if c == old else c for c in component]
@@ -181,19 +180,19 @@ def _cheapest(tracers: Sequence[_Tracer], i: int, j: int) -> tuple[float, list[l
 
 
 SEAMS = ("shortest", "hidden")
-_VISIBLE_COST = 3.0  # how much dearer an edge is that is seen from all sides
+_VISIBLE_COST = 3.0  # extra cost of an edge that is visible from all sides, times its length
 
 
 def seam_costs(vertices: np.ndarray, faces: np.ndarray, seam: str) -> np.ndarray:
-    """What it costs a seam to go along each edge (E,).
+    """Costs (E,) of a seam along each edge.
 
     Args:
         vertices, faces: the mesh (V, 3), (F, 3).
-        seam: ``shortest``, the edge's length; or ``hidden``, more for edges that are seen from
-            many sides (after Sheffer and Hart 2002, "Seamster").
+        seam: ``shortest``, the edge's length; or ``hidden``, more for visible edges (after Sheffer
+            and Hart 2002, "Seamster").
 
     Raises:
-        NsmError: another word.
+        NsmError: ``unknown_option``.
     """
     length = edge_lengths(vertices, faces)
     if seam == "shortest":
@@ -242,9 +241,9 @@ def boundary_keys(origin: np.ndarray, loop: np.ndarray, landmarks: np.ndarray) -
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-def turned_alike(keys: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-    """The keys (K, 2) of several loops, each turned so that their landmarks come in the order of
-    the first; None where that cannot be."""
+def aligned_keys(keys: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+    """The keys (K, 2) of several loops, rotated so that their landmarks come in the same order;
+    None if no rotation does that."""
     first = keys[0][:, 0].tolist()
     result = [keys[0]]
     for other in keys[1:]:

@@ -1,10 +1,9 @@
-"""Meshes drawn together vertex by vertex, so that each step can be undone in the plane.
+"""Decimation by half-edge collapses that can be undone in the plane.
 
-A step draws a vertex into a neighbour (half-edge collapse; Hoppe 1996, "Progressive meshes"). What
-it leaves is a fan of triangles around that neighbour; wherever these lie in the plane, without
-flips, there is room near the neighbour to put the vertex back without flips (Sander et al. 2002,
-"Signal-specialized parametrization"). Many steps that do not touch each other make a round, which
-is computed at once.
+A collapse moves a vertex onto a neighbour (Hoppe 1996, "Progressive meshes") and leaves a fan of
+triangles around it. However the fan is laid out in the plane, as long as it has no flips, the
+vertex can be reinserted near the neighbour without flips (Sander et al. 2002, "Signal-specialized
+parametrization"). Collapses that do not touch each other form a round, computed at once.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from nsm.surfaces import topology
 _TURN, _SHAPE = 0.34, 0.03
 _MOST_NEIGHBOURS = 12
 _FEWEST_ON_BOUNDARY = 32
-_LEAST_SHARE = 0.005  # of the vertices: rounds that remove fewer are the last
+_LEAST_SHARE = 0.005  # of the vertices: a round that removes fewer is the last
 
 
 @dataclass(frozen=True)
 class Round:
-    """Vertices (N,) that were drawn into neighbours, target (N,), none near another.
+    """Independent collapses of vertices (N,) onto neighbours, target (N,).
 
-    before: (N,) the other neighbour on the boundary of a vertex on it, -1 inside. corners (M,):
-    the places 3f + k in the list of faces that named these vertices, and name their targets now;
-    star (M,), which of the N each belonged to.
+    before (N,): of a boundary vertex, its boundary neighbour other than the target; -1 inside.
+    corners (M,): the flat indices 3f + k into the faces where a collapsed vertex was replaced by
+    its target; star (M,): which of the N collapses each belongs to.
     """
 
     vertex: np.ndarray
@@ -39,8 +38,8 @@ class Round:
     corners: np.ndarray
     star: np.ndarray
 
-    def chosen(self, keep: np.ndarray) -> Round:
-        """That of a mask (N,) of the vertices."""
+    def subset(self, keep: np.ndarray) -> Round:
+        """The collapses that a mask (N,) keeps."""
         mine, number = keep[self.star], np.cumsum(keep) - 1
         return Round(
             self.vertex[keep],
@@ -54,15 +53,15 @@ class Round:
 def coarsen(
     vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, count: int
 ) -> tuple[np.ndarray, list[Round]]:
-    """Draw a mesh (V, 3), (F, 3) of disc shape together until about ``count`` faces are left.
+    """Collapse edges of a disc-shaped mesh (V, 3), (F, 3) until about ``count`` faces are left.
 
-    Vertices stay where they are. No inner edge comes to join two boundary vertices.
+    Remaining vertices do not move. No inner edge comes to join two boundary vertices.
 
     Args:
-        held: (V,) mask of vertices that stay.
+        held: (V,) mask of vertices that are not collapsed.
 
     Returns:
-        the faces (F, 3), those that are gone with two equal corners, and the rounds.
+        The faces (F, 3), where removed ones have two equal corners; and the rounds.
     """
     faces, flat = faces.copy(), np.arange(3)
     alive = np.arange(len(faces))
@@ -89,12 +88,12 @@ def coarsen(
 
 
 def undo(faces: np.ndarray, step: Round) -> None:
-    """Put a round's vertices back into the faces (F, 3)."""
+    """Reinsert a round's vertices into the faces (F, 3), in place."""
     faces.ravel()[step.corners] = step.vertex[step.star]
 
 
 def present_faces(faces: np.ndarray) -> np.ndarray:
-    """Those of the faces (F, 3) that are not gone."""
+    """Those of the faces (F, 3) that are not removed."""
     return faces[_has_area(faces)]
 
 
@@ -104,7 +103,7 @@ def _has_area(faces: np.ndarray) -> np.ndarray:
 
 
 class Rings:
-    """The neighbours of each vertex: indices[start[v] : start[v + 1]], n vertices, all in faces."""
+    """The neighbours of each of n vertices, all in faces: indices[start[v] : start[v + 1]]."""
 
     def __init__(self, faces: np.ndarray, n: int) -> None:
         tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -119,9 +118,9 @@ class Rings:
         return np.minimum(value, np.minimum.reduceat(value[self.indices], self.start))
 
     def apart(self, priority: np.ndarray, distance: int) -> np.ndarray:
-        """Mask (N,) of vertices, of finite priority and lowest first, more than 1 or 2 edges apart.
+        """Mask (N,) of vertices more than ``distance`` (1 or 2) edges apart.
 
-        Not all that could be added are there.
+        Those with the lowest finite priority come first. The set need not be maximal.
         """
         priority, chosen = priority.copy(), np.zeros(len(priority), dtype=bool)
         for _ in range(3):
@@ -139,20 +138,20 @@ class Rings:
 def _collapses(
     points: np.ndarray, faces: np.ndarray, held: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (N,) to be drawn into neighbours, these, and the others before them on the rim."""
+    """Vertices (N,) to collapse, their targets, and their other boundary neighbours or -1."""
     n = len(points)
     rings = Rings(faces, n)
-    row, column, on_rim = rings.row, rings.indices, rings.matrix.data == 1
-    rim = np.bincount(row[on_rim], minlength=n) > 0
-    rim_neighbours = np.bincount(row, weights=rim[column], minlength=n)
-    # an inner vertex goes to the boundary only if that makes no chord; one of the boundary along it
-    allowed = np.where(rim[row], on_rim & (rim_neighbours[row] == 2), True)
-    allowed &= rim[row] | ~rim[column] | (rim_neighbours[row] == 1)
+    row, column, on_boundary = rings.row, rings.indices, rings.matrix.data == 1
+    boundary = np.bincount(row[on_boundary], minlength=n) > 0
+    boundary_neighbours = np.bincount(row, weights=boundary[column], minlength=n)
+    # inner vertices move onto the boundary only if that makes no chord; boundary ones stay on it
+    allowed = np.where(boundary[row], on_boundary & (boundary_neighbours[row] == 2), True)
+    allowed &= boundary[row] | ~boundary[column] | (boundary_neighbours[row] == 1)
     allowed &= ~held[row]
-    if rim.sum() <= _FEWEST_ON_BOUNDARY:
-        allowed &= ~rim[row]
+    if boundary.sum() <= _FEWEST_ON_BOUNDARY:
+        allowed &= ~boundary[row]
     length = np.linalg.norm(points[row] - points[column], axis=1)
-    # chance makes what fails in one round be tried otherwise in the next
+    # random costs: a collapse that fails in one round is tried differently in the next
     cost = np.where(allowed, length * rng.uniform(1.0, 1.7, len(row)), np.inf)
     least = np.minimum.reduceat(cost, rings.start)
     place = np.flatnonzero(np.isfinite(cost) & (cost == least[row]))
@@ -162,24 +161,23 @@ def _collapses(
     ones = rings.matrix.copy()
     ones.data = np.ones(len(row), dtype=np.int16)
     common = np.asarray(ones[vertex].multiply(ones[target]).sum(axis=1)).ravel()
-    good = common == np.where(rim[vertex], 1, 2)
+    good = common == np.where(boundary[vertex], 1, 2)
     good &= rings.degree[vertex] + rings.degree[target] - 4 <= _MOST_NEIGHBOURS
     vertex, target = vertex[good], target[good]
     into = np.full(n, -1)
     into[vertex] = target
-    spoilt = _spoilt(points, faces, into)
-    priority = np.where((into >= 0) & ~spoilt, least, np.inf)
+    bad = _leaves_bad_triangles(points, faces, into)
+    priority = np.where((into >= 0) & ~bad, least, np.inf)
     vertex = np.flatnonzero(rings.apart(priority, 2))
-    # the neighbour on the boundary that a vertex is not drawn into
     before = np.full(n, -1)
-    other = on_rim & (column != into[row])
+    other = on_boundary & (column != into[row])
     before[row[other]] = column[other]
-    return vertex, into[vertex], np.where(rim[vertex], before[vertex], -1)
+    return vertex, into[vertex], np.where(boundary[vertex], before[vertex], -1)
 
 
-def _spoilt(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
-    """Mask (N,) of vertices that leave bad triangles if they are drawn into others, ``into``."""
-    spoilt = np.zeros(len(points), dtype=bool)
+def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
+    """Mask (N,) of vertices that leave bad triangles if collapsed onto others, ``into``."""
+    result = np.zeros(len(points), dtype=bool)
     for k in range(3):
         v, b, c = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
         w = into[v]
@@ -193,5 +191,5 @@ def _spoilt(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarr
         shape_before = before / (side + ((b - v) ** 2).sum(axis=1) + ((c - v) ** 2).sum(axis=1))
         bad = (old * new).sum(axis=1) < _TURN * double * before
         bad |= shape < np.minimum(_SHAPE, shape_before)
-        spoilt[faces[kept, k][bad]] = True
-    return spoilt
+        result[faces[kept, k][bad]] = True
+    return result

@@ -25,43 +25,33 @@ class Disc(BoundedDomain):
     network_out_dim = 3
 
     def boundary_points(self, fractions: np.ndarray) -> np.ndarray:
-        """Points (B, 2) of the circle at fractions (B,) of the way around."""
         return _on_circle(2 * np.pi * np.asarray(fractions, dtype=np.float64))
 
     def boundary_fractions(self, points: np.ndarray) -> np.ndarray:
-        """Fractions (B,) in [0, 1) of points (B, 2) of the circle."""
         return (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)) % 1.0
 
     def spread(self, along: np.ndarray, name: str = "mesh") -> np.ndarray:
-        """Points (B, 2) of the circle by arc length (see :meth:`BoundedDomain.spread`)."""
         return _on_circle(2 * np.pi * along[:-1] / along[-1])
 
     def tangents(self, points: np.ndarray) -> np.ndarray:
-        """Unit tangents (B, 2), counter-clockwise."""
         return np.stack([-points[:, 1], points[:, 0]], axis=1)
 
     def curvature(self, points: np.ndarray) -> np.ndarray:
-        """Curvature vectors (B, 2) of the circle, towards its centre."""
         return -points
 
     def slide(self, points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Points (B, 2) of the circle, turned by arcs of signed lengths (B,)."""
         return _on_circle(np.arctan2(points[:, 1], points[:, 0]) + lengths)
 
     def retract(self, points: np.ndarray) -> np.ndarray:
-        """Points (B, 2) of tangents or chords, scaled onto the circle."""
         return points / np.linalg.norm(points, axis=1, keepdims=True)
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """‖p‖ − 1 (...,) for points (..., 2)."""
         return points.norm(dim=-1) - 1  # unlike a root of squares, has a gradient at the centre
 
     def project(self, points: Tensor) -> Tensor:
-        """The nearest points (..., 2) of the disc."""
         return points / points.norm(dim=-1, keepdim=True).clamp(min=1)
 
     def to_boundary(self, points: Tensor) -> Tensor:
-        """Points (..., 2), none at the centre, scaled onto the circle."""
         return points / points.norm(dim=-1, keepdim=True)
 
     def nearest_rotation(self, rotation: Tensor) -> Tensor:
@@ -69,7 +59,6 @@ class Disc(BoundedDomain):
         return rotation
 
     def rotations(self) -> np.ndarray:
-        """Rotations (48, 2, 2) in even steps."""
         return rotations(_ROTATIONS)
 
     def mesh(self, rings: int = 80) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,11 @@
-"""Injective maps of a disc-shaped mesh onto the unit disc or the square [-1,1]^2.
+"""Injective layouts of a disc-shaped mesh over a domain with a convex boundary.
 
-Tutte's embedding (uniform weights, convex boundary) comes first because it is injective whatever
-the mesh. SLIM (Rabinovich et al. 2017, "Scalable Locally Injective Mappings") then lowers the
-symmetric Dirichlet energy: libigl's with the boundary held, which is fast, and after it our own
-steps, in which boundary vertices slide along the boundary of the domain. Our steps keep the
-boundary exactly on the domain's and never accept a flipped triangle, which libigl's soft
-constraints cannot promise. Large meshes are laid out coarse first
-(:mod:`nsm.domains.coarse_to_fine`).
+Tutte's embedding comes first: with uniform weights and a convex boundary it is injective for every
+mesh. SLIM (Rabinovich et al. 2017, "Scalable Locally Injective Mappings") then lowers the symmetric
+Dirichlet energy: libigl's with a fixed boundary, which is fast, and after it
+:mod:`nsm.domains.sliding`, whose boundary vertices slide along ∂Ω. The latter keeps the boundary
+exactly on ∂Ω and never flips a triangle, which libigl's soft constraints cannot promise. Large
+meshes are laid out coarse to fine (:mod:`nsm.domains.coarse_to_fine`).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nsm.domains.coarse_to_fine import laid_out
+from nsm.domains.coarse_to_fine import embed_coarse_to_fine
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.sliding import slide
 from nsm.domains.tutte import tutte
@@ -27,16 +26,22 @@ from nsm.surfaces.geometry import triangle_distortion
 if TYPE_CHECKING:
     from nsm.domains.base import BoundedDomain, Keys
 
-# slim_held: SLIM without the sliding steps after it, a quick look at what slim would give
+# slim_held: SLIM without the sliding steps, a fast estimate of slim
 METHODS = ("tutte", "slim_held", "slim")
-# more faces than this are laid out coarse first
+# meshes with more faces than LARGE are first decimated to COARSE faces
 LARGE, COARSE = 40_000, 12_000
 
 
 @dataclass(frozen=True)
 class Embedding:
-    """uv (V,2) in the domain; medians of symmetric Dirichlet, its own and that of Tutte's embedding
-    (for a mesh laid out coarse first, of the coarse one); log."""
+    """A layout over Ω.
+
+    Attributes:
+        uv: (V, 2) in Ω.
+        distortion: median symmetric Dirichlet energy of the map from Ω to the mesh.
+        tutte_distortion: that of Tutte's embedding, of the coarse mesh if there was one.
+        log: fallbacks taken, a line each.
+    """
 
     uv: np.ndarray
     distortion: float
@@ -70,40 +75,41 @@ def embed(
     if keys is not None:
         held[keys.vertices] = True
 
-    before = float("nan")
+    tutte_distortion = float("nan")
 
     def solve(
-        points: np.ndarray,
-        triangles: np.ndarray,
-        rim: np.ndarray,
-        at: np.ndarray,
-        stay: np.ndarray,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        loop: np.ndarray,
+        boundary: np.ndarray,
+        held: np.ndarray,
     ) -> np.ndarray:
-        nonlocal before
-        start = _start(points, triangles, rim, at, name, log)
-        before = _median_distortion(points, triangles, start)
+        nonlocal tutte_distortion
+        start = _tutte_start(vertices, faces, loop, boundary, name, log)
+        tutte_distortion = _median_distortion(vertices, faces, start)
         if method == "tutte":
             return start
-        uv = _slim_held(points, triangles, start, rim, at, log)
-        steps = _sliding_steps(len(triangles)) if method == "slim" else 0
-        uv = slide(points, triangles, uv, rim, domain, steps, stay)
-        if flipped_triangles(uv, triangles) or boundary_self_intersections(uv, rim):
-            log.append("SLIM result was not injective: Tutte's embedding kept")
-            return start
-        return uv
+        uv = _slim_held(vertices, faces, start, loop, boundary, log)
+        steps = _sliding_steps(len(faces)) if method == "slim" else 0
+        uv = slide(vertices, faces, uv, loop, domain, steps, held)
+        if _is_injective(uv, faces, loop):
+            return uv
+        log.append("SLIM's result was not injective: Tutte's embedding kept")
+        return start
 
     uv = None
     if method != "tutte" and len(faces) > LARGE:
-        uv = laid_out(vertices, faces, loop, boundary, domain, held, solve, COARSE)
-        if uv is not None and (
-            flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop)
-        ):
-            uv = None
-        if uv is None:
-            log[:] = ["a coarse mesh's layout did not carry over: laid out at once"]
+        uv = embed_coarse_to_fine(vertices, faces, loop, boundary, domain, held, solve, COARSE)
+        if uv is None or not _is_injective(uv, faces, loop):
+            uv, log[:] = None, ["coarse-to-fine layout failed: whole mesh laid out at once"]
     if uv is None:
         uv = solve(vertices, faces, loop, boundary, held)
-    return Embedding(uv, _median_distortion(vertices, faces, uv), before, tuple(log))
+    distortion = _median_distortion(vertices, faces, uv)
+    return Embedding(uv, distortion, tutte_distortion, tuple(log))
+
+
+def _is_injective(uv: np.ndarray, faces: np.ndarray, loop: np.ndarray) -> bool:
+    return not (flipped_triangles(uv, faces) or boundary_self_intersections(uv, loop))
 
 
 def check_method(method: str, name: str) -> None:
@@ -116,7 +122,7 @@ def check_method(method: str, name: str) -> None:
         )
 
 
-def _start(
+def _tutte_start(
     vertices: np.ndarray,
     faces: np.ndarray,
     loop: np.ndarray,
@@ -124,7 +130,7 @@ def _start(
     name: str,
     log: list[str],
 ) -> np.ndarray:
-    """Tutte's embedding (V,2), checked; NsmError if it has flips."""
+    """Tutte's embedding (V,2) without flips, or NsmError."""
     start = tutte(vertices, faces, loop, boundary)
     if flipped_triangles(start, faces):
         start = tutte(vertices, faces, loop, boundary, weights="mean_value")
@@ -132,8 +138,8 @@ def _start(
     flipped = flipped_triangles(start, faces)
     if flipped:
         raise NsmError(
-            f"{name}: {flipped} triangles flip in Tutte's embedding (parts too long and thin for "
-            "floating point); give seam_vertices at the tips of long parts",
+            f"{name}: {flipped} triangles flip in Tutte's embedding, as long thin parts exceed "
+            "floating point; give seam_vertices at the tips of long parts",
             kind="not_injective",
             key=name,
         )
@@ -148,7 +154,7 @@ def _slim_held(
     boundary: np.ndarray,
     log: list[str],
 ) -> np.ndarray:
-    """libigl's SLIM with the boundary held softly, brought back to the boundary without flips."""
+    """libigl's SLIM with a softly fixed boundary, moved exactly to ∂Ω without flips."""
     import igl
 
     iterations = 30 if len(faces) < 40_000 else 12
@@ -169,7 +175,7 @@ def _slim_held(
         log.append(f"libigl SLIM failed ({error}): sliding steps start from Tutte's embedding")
         return start
     solved[loop] = boundary
-    # Any point on the way from Tutte's embedding is as good a start as it has no flips.
+    # shorten the way from Tutte's embedding until nothing flips
     share = 1.0
     for _ in range(12):
         blend = start + share * (solved - start)
@@ -180,7 +186,7 @@ def _slim_held(
 
 
 def _sliding_steps(n_faces: int) -> int:
-    """How many sliding steps a mesh gets, so that time stays within seconds."""
+    """Number of sliding steps, such that they take seconds."""
     return int(np.clip(800_000 / n_faces, 6, 60))
 
 

@@ -1,4 +1,4 @@
-"""Several meshes prepared together, so that their domains correspond."""
+"""Joint preparation of several meshes, so that their domains correspond."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from nsm.domains.base import BoundedDomain, Domain, Keys
 from nsm.domains.common_seams import (
     SEAMS,
+    aligned_keys,
     boundary_keys,
     corresponding_paths,
     mutually_far,
     seam_costs,
-    turned_alike,
 )
 from nsm.domains.disc import Disc
 from nsm.domains.names import bounded
@@ -31,15 +31,15 @@ from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.location import locate
 from nsm.surfaces.validation import CleanMesh, clean
 
-# auto: shares of the landmarks that the seam is tried through
+# seam=auto tries seams through these shares of the landmarks
 _SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
 _DISC = Disc()  # where seams are compared, whatever the domain
-_WORST = 1e3  # a triangle's distortion counts no more than this
+_WORST = 1e3  # upper bound on a triangle's distortion
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh as read: name, vertices (V, 3), faces (F, 3), and a line for each thing noted."""
+    """A mesh as read: name, vertices (V, 3), faces (F, 3), and the log of reading it."""
 
     name: str
     vertices: np.ndarray
@@ -68,12 +68,12 @@ def prepare_jointly(
         landmarks: (L,) vertices of each, in the same order.
         domain, parameterization, cache: as for :meth:`Surface.load`.
         seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
-            ``auto``, which tries both, and keeps what lets the domains agree best.
+            ``auto``, which tries both and keeps the seam for which the domains agree best.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
-            all of them, or, with ``auto``, the number that lets the domains agree best.
+            all of them, or, with ``auto``, the number for which the domains agree best.
 
     Raises:
-        NsmError: a mesh that cannot be prepared, or no corresponding seams.
+        NsmError: a mesh that cannot be prepared; ``no_common_seam``.
     """
     domain = domain_of(domain)
     cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
@@ -105,7 +105,7 @@ def prepare_jointly(
         "method": parameterization,
         "seam": [seam, seam_landmarks],
     }
-    # of the files as they are: cleaned alike, they may still have other vertex numbers
+    # keys of the files: meshes that are equal once cleaned may still differ in vertex numbers
     names = [cache_.preparation_key(m.vertices, m.faces, options) for m in meshes]
     if cache:
         stored = [cache_.read(key) for key in names]
@@ -115,7 +115,9 @@ def prepare_jointly(
                 for m, s in zip(meshes, stored, strict=True)
                 if s is not None
             ]
-    surfaces = _cut_alike(meshes, cleaned, found, domain, parameterization, seam, seam_landmarks)
+    surfaces = _cut_and_embed(
+        meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
+    )
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
@@ -136,8 +138,8 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _CutAlike:
-    """One way to cut all meshes: the discs, and the keys (K,) on each one's boundary."""
+class _CommonCut:
+    """One way to cut all meshes: the discs, and the keys (K,) on each boundary."""
 
     seam: str
     count: int
@@ -145,7 +147,7 @@ class _CutAlike:
     keys: list[np.ndarray]
 
 
-def _cut_alike(
+def _cut_and_embed(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
@@ -168,12 +170,12 @@ def _cut_alike(
         tried = [
             (_disagreement(way, landmarks), k, way)
             for k, (path, count) in enumerate(itertools.product(SEAMS, counts))
-            if (way := _opened_alike(meshes, cleaned, landmarks, path, costs[path], count))
+            if (way := _common_cut(meshes, cleaned, landmarks, path, costs[path], count))
             is not None
         ]
         best = min(tried, default=(0.0, 0, None))[2]
     else:
-        best = _opened_alike(meshes, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
+        best = _common_cut(meshes, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
     if best is None:
         raise NsmError(
             "no seams through the landmarks were found: some are too close together for the "
@@ -182,9 +184,9 @@ def _cut_alike(
             key="landmarks",
         )
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
-    words = (
-        f"seam led along {best.seam} paths through {best.count} of {total} landmarks, alike on "
-        "all meshes"
+    line = (
+        f"seam led along {best.seam} paths through {best.count} of {total} landmarks, the same "
+        "on all meshes"
     )
     return [
         Surface.from_cut(
@@ -194,20 +196,20 @@ def _cut_alike(
             domain=domain,
             parameterization=method,
             keys=Keys(key, fractions),
-            log=(*m.log, *c.log, words),
+            log=(*m.log, *c.log, line),
         )
         for m, c, cut, key in zip(meshes, cleaned, best.cuts, best.keys, strict=True)
     ]
 
 
-def _opened_alike(
+def _common_cut(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
     seam: str,
     costs: Sequence[np.ndarray],
     count: int,
-) -> _CutAlike | None:
+) -> _CommonCut | None:
     """The meshes cut along one tree through ``count`` landmarks, whose branches are the cheapest
     by costs (E,) of each mesh's edges; None if there is no such tree."""
     pairs = [(c.vertices, c.faces) for c in cleaned]
@@ -220,26 +222,26 @@ def _opened_alike(
         cut_along_paths(c.vertices, c.faces, p, name=m.name)
         for c, p, m in zip(cleaned, paths, meshes, strict=True)
     ]
-    keys = turned_alike(
+    keys = aligned_keys(
         [boundary_keys(cut.origin, cut.loop, ids) for cut, ids in zip(cuts, on_seam, strict=True)]
     )
     assert keys is not None, "branches in the same cyclic order make equal walks"
-    return _CutAlike(seam, len(chosen), cuts, [k[:, 1] for k in keys])
+    return _CommonCut(seam, len(chosen), cuts, [k[:, 1] for k in keys])
 
 
-def _disagreement(way: _CutAlike, landmarks: Sequence[np.ndarray]) -> float:
-    """How badly the domains agree: the distortion of the maps that take each point of one domain
-    to the same point of another, and how far these miss the landmarks off the seam.
+def _disagreement(way: _CommonCut, landmarks: Sequence[np.ndarray]) -> float:
+    """How badly the domains agree: the distortion of the identity between two domains, times how
+    far it misses the landmarks off the seam.
 
-    The worst ordered pair counts. Landmarks on the wrong side of a seam lie far apart in Ω, and
-    no map without folds brings them together; hence the factor.
+    The worst ordered pair counts. Landmarks on the wrong side of a seam lie far apart in Ω, and no
+    map without folds brings them together; hence the factor.
     """
     fractions = np.mean(
         [_arc_lengths(cut, key) for cut, key in zip(way.cuts, way.keys, strict=True)], axis=0
     )
     flat = [
         _DISC.embed(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
-        for cut, key in zip(_of_unit_area(way.cuts), way.keys, strict=True)
+        for cut, key in zip(_of_disc_area(way.cuts), way.keys, strict=True)
     ]
     places = []
     for cut, uv, ids in zip(way.cuts, flat, landmarks, strict=True):
@@ -247,7 +249,7 @@ def _disagreement(way: _CutAlike, landmarks: Sequence[np.ndarray]) -> float:
         inner = [v for v in off if v not in set(cut.loop.tolist())]
         places.append(uv[inner])
     worst = 0.0
-    discs = _of_unit_area(way.cuts)
+    discs = _of_disc_area(way.cuts)
     for i, j in itertools.permutations(range(len(discs)), 2):
         image = locate(flat[i], flat[j], discs[j].faces).take(discs[j].vertices, discs[j].faces)
         value = triangle_distortion(discs[i].vertices, image, discs[i].faces)
@@ -258,8 +260,8 @@ def _disagreement(way: _CutAlike, landmarks: Sequence[np.ndarray]) -> float:
     return worst
 
 
-def _of_unit_area(cuts: Sequence[Cut]) -> list[Cut]:
-    """The discs scaled to the area of Ω, as the distortion wants them."""
+def _of_disc_area(cuts: Sequence[Cut]) -> list[Cut]:
+    """The discs scaled to the area of Ω."""
     scales = [np.sqrt(_DISC.area / topology.face_areas(c.vertices, c.faces).sum()) for c in cuts]
     return [replace(c, vertices=c.vertices * s) for c, s in zip(cuts, scales, strict=True)]
 
@@ -283,7 +285,7 @@ def common_fractions(
     over the discs. The keys nearest to the domain's corners become the corners.
     """
     gaps = []
-    for cut, key in zip(_of_unit_area(cuts), keys, strict=True):
+    for cut, key in zip(_of_disc_area(cuts), keys, strict=True):
         uv = _DISC.embed(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
         angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
         gaps.append((np.roll(angle, -1) - angle) % 1.0)
@@ -306,11 +308,11 @@ class Matched:
     on_boundary: int
 
     def seam(self, domain: BoundedDomain, count: int) -> np.ndarray:
-        """(T, 2, 2) pairs of points of ∂Ω that are one point of each surface, if cut alike.
+        """(T, 2, 2) pairs of points of ∂Ω that are one point of each surface with this seam.
 
-        Between the landmarks at its ends, each branch of the seam is walked along twice, there
-        and back; ``count`` points of the way there are paired with those of the way back, by
-        their shares of the ways. Nothing is paired where the walk is not around a tree.
+        The walk around ∂Ω passes each branch of the seam twice, out and back. ``count`` points on
+        the way out are paired with those on the way back at the same shares of the length. Nothing
+        is paired where the walk is not around a tree.
         """
         numbers = self.numbers[: self.on_boundary].tolist()
         t = domain.boundary_fractions(self.points[0][: self.on_boundary])
@@ -326,10 +328,8 @@ class Matched:
         for (a, b), (begin, span) in ways.items():
             if a < b and (b, a) in ways:
                 back, width = ways[b, a]
-                ways_out_and_back = (begin + span * share, back + width * (1 - share))
-                pairs.append(
-                    np.stack([domain.boundary_points(w % 1.0) for w in ways_out_and_back], 1)
-                )
+                both = (begin + span * share, back + width * (1 - share))
+                pairs.append(np.stack([domain.boundary_points(w % 1.0) for w in both], axis=1))
         return np.concatenate(pairs) if pairs else np.zeros((0, 2, 2))
 
 
@@ -350,8 +350,8 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
         boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], s.kept(ids.tolist()))
         for s, ids in zip(surfaces, landmarks, strict=True)
     ]
-    alike = turned_alike(keys)
-    if alike is None:
+    aligned = aligned_keys(keys)
+    if aligned is None:
         names = " and ".join(s.name for s in surfaces)
         raise NsmError(
             f"the boundaries of {names}, once cut, pass the landmarks differently; give meshes "
@@ -362,6 +362,6 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
     inner = np.setdiff1d(np.arange(len(landmarks[0])), keys[0][:, 0])
     points = [
         np.concatenate([s.uv[key[:, 1]], s.preimages(ids[inner].tolist())])
-        for s, key, ids in zip(surfaces, alike, landmarks, strict=True)
+        for s, key, ids in zip(surfaces, aligned, landmarks, strict=True)
     ]
-    return Matched(points, np.concatenate([alike[0][:, 0], inner]), len(alike[0]))
+    return Matched(points, np.concatenate([aligned[0][:, 0], inner]), len(aligned[0]))

@@ -1,5 +1,4 @@
-"""Flat meshes, uv (V,2) with faces (F,3): what tells whether they are injective, and how much a map
-from them to the surface distorts."""
+"""Flat meshes, uv (V,2) with faces (F,3): areas, distortion, and tests of injectivity."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def flipped_triangles(uv: np.ndarray, faces: np.ndarray) -> int:
 def boundary_self_intersections(uv: np.ndarray, loop: np.ndarray) -> int:
     """Number of pairs of sides of the closed polygon uv[loop] (B,2) that cross or touch.
 
-    Neighbouring sides share a point by right and are counted only if they fold back.
+    Neighbouring sides, which share a point, count only if they fold back.
     """
     p = uv[loop]
     q = np.roll(p, -1, axis=0)

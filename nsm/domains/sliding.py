@@ -127,9 +127,8 @@ class _Problem:
         block = np.einsum("fkl,fij->fkilj", dots, w2).reshape(len(faces), 6, 6)
         n = len(uv)
         index = (faces[:, :, None] * 2 + np.arange(2)).reshape(-1, 6)
-        rows = np.repeat(index, 6, axis=1).ravel()
-        columns = np.tile(index, (1, 6)).ravel()
-        hessian = coo_matrix((block.ravel(), (rows, columns)), shape=(2 * n, 2 * n)).tocsc()
+        places = (np.repeat(index, 6, axis=1).ravel(), np.tile(index, (1, 6)).ravel())
+        hessian = coo_matrix((block.ravel(), places), shape=(2 * n, 2 * n)).tocsc()
         g = np.zeros(2 * n)
         np.add.at(g, index.ravel(), force.ravel())
         # columns of freedom: both coordinates inside, the tangent on the boundary

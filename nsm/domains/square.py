@@ -27,14 +27,12 @@ class Square(BoundedDomain):
     corner_fractions = (0.0, 0.25, 0.5, 0.75)
 
     def boundary_points(self, fractions: np.ndarray) -> np.ndarray:
-        """Points (B, 2) of the sides at fractions (B,) of the way around."""
         t = np.asarray(fractions, dtype=np.float64)
         side = np.floor(4 * t).astype(int) % 4
         share = (4 * t - np.floor(4 * t))[:, None]
         return _CORNERS[side] + share * (_CORNERS[(side + 1) % 4] - _CORNERS[side])
 
     def boundary_fractions(self, points: np.ndarray) -> np.ndarray:
-        """Fractions (B,) in [0, 1) of points (B, 2) of the sides."""
         u, v = points.T
         sides = np.stack([-v, u, v, -u])  # each side is where one of these is 1
         along = np.stack([u, v, -u, -v])
@@ -43,10 +41,7 @@ class Square(BoundedDomain):
         return (0.25 * (side + share)) % 1.0
 
     def spread(self, along: np.ndarray, name: str = "mesh") -> np.ndarray:
-        """Points (B, 2) of the sides by arc length (see :meth:`BoundedDomain.spread`).
-
-        Four vertices near the quarters of the length become the corners.
-        """
+        """See :meth:`BoundedDomain.spread`: vertices near the quarters become the corners."""
         count = len(along) - 1
         if count < 4:
             raise NsmError(
@@ -70,24 +65,19 @@ class Square(BoundedDomain):
         return np.stack([~vertical, vertical], axis=1).astype(np.float64)
 
     def curvature(self, points: np.ndarray) -> np.ndarray:
-        """Zeros (B, 2): the sides are straight."""
         return np.zeros_like(points)
 
     def retract(self, points: np.ndarray) -> np.ndarray:
-        """Points (B, 2) on the lines of the sides, clipped to the sides."""
         return points.clip(-1.0, 1.0)
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Distances (...,) of points (..., 2) to the sides, negative inside."""
         q = points.abs() - 1
         return q.clamp(min=0).norm(dim=-1) + q.amax(dim=-1).clamp(max=0)
 
     def project(self, points: Tensor) -> Tensor:
-        """The nearest points (..., 2) of the square."""
         return points.clamp(-1, 1)
 
     def to_boundary(self, points: Tensor) -> Tensor:
-        """Points (..., 2), none at the centre, scaled onto the sides."""
         return points / points.norm(math.inf, dim=-1, keepdim=True)
 
     def nearest_rotation(self, rotation: Tensor) -> Tensor:
@@ -96,7 +86,6 @@ class Square(BoundedDomain):
         return rotation.new_tensor(rotation_matrix(turns * math.pi / 2))
 
     def rotations(self) -> np.ndarray:
-        """The four rotations (4, 2, 2) that keep the square."""
         return rotations(4)
 
     def mesh(self, rings: int = 60) -> tuple[np.ndarray, np.ndarray]:

@@ -26,24 +26,26 @@ from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.validation import CleanMesh, clean
 
+ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A mesh cut to a disc, normalised, and parameterised injectively into Ω.
 
     Attributes:
-        name: what it is called in logs and file names.
-        vertices: (V, 3) float64, centred, scaled so that the area is that of Ω (π or 4).
+        name: in logs and file names.
+        vertices: (V, 3) float64, centred, scaled so that the area is that of Ω.
         faces: (F, 3) int64, counter-clockwise in Ω.
         uv: (V, 2) float64 in Ω, without flipped triangles.
         domain: Ω.
         source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
-        cut_vertex: (W,) int64, of each vertex of the mesh file the first vertex here that it, or
-            the one that it was merged with, became; or -1 if it is not on the surface.
-        seam_pairs: (T, 2) int64, pairs of vertices on the seam that were one point.
+        cut_vertex: (W,) int64, for each vertex of the mesh file its first copy here (or that of
+            the vertex it was merged with); -1 if it is not on the surface.
+        seam_pairs: (T, 2) int64, pairs of vertices on the seam that are one point of the mesh.
         scale, center: ``vertices = (original - center) * scale``.
         quality: figures of the preparation (see :meth:`from_arrays`).
-        log: what was repaired, converted or cut, a line each.
+        log: repairs, conversions and cuts, a line each.
     """
 
     name: str
@@ -74,8 +76,8 @@ class Surface:
         Args:
             path_or_name: an OBJ, PLY, OFF, STL, GLTF or GLB file, or a catalogue name.
             domain: Ω, or the name of one of :data:`nsm.domains.DOMAINS`.
-            seam_vertices: vertices (numbers in the file) that the seam of the cut passes through;
-                without them, mutually far points are chosen where a seam is needed.
+            seam_vertices: vertices (numbers in the file) that the seam passes through; by default
+                mutually far ones where a seam is needed.
             parameterization: ``slim`` or ``tutte``.
             cache: keep the prepared surface on disk, keyed by content.
 
@@ -124,8 +126,8 @@ class Surface:
 
         ``quality`` holds flipped_triangles, boundary_self_intersections (both 0, or this raises),
         median_symmetric_dirichlet and tutte_median_symmetric_dirichlet (of the map from Ω to the
-        mesh; Tutte's of a large mesh is that of the coarse one that it is laid out by),
-        seam_vertices (how many doubled vertices) and seconds.
+        mesh; for large meshes, Tutte's of the coarse mesh), seam_vertices (the number of
+        ``seam_pairs``) and seconds.
 
         Raises:
             NsmError: the mesh cannot be repaired, cut or flattened without flips.
@@ -139,36 +141,21 @@ class Surface:
         stored = cache_.read(key) if cache else None
         if stored is not None:
             return cls.from_stored(name, domain, stored)
-        surface = cls._prepare(vertices, faces, name, domain, seam, parameterization, log)
+        mesh = clean(vertices, faces, name)
+        if seam is not None:
+            seam = _merged(seam, mesh, name)
+        cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
+        surface = cls.from_cut(
+            cut,
+            mesh,
+            name=name,
+            domain=domain,
+            parameterization=parameterization,
+            log=(*log, *mesh.log),
+        )
         if cache:
             cache_.write(key, surface.to_stored())
         return surface
-
-    @classmethod
-    def _prepare(
-        cls,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        name: str,
-        domain: Domain,
-        seam: list[int] | None,
-        method: str,
-        log: Sequence[str],
-    ) -> Surface:
-        mesh = clean(vertices, faces, name)
-        if seam is not None:
-            for v in seam:
-                if not 0 <= v < len(mesh.merged) or mesh.merged[v] < 0:
-                    raise NsmError(
-                        f"{name}: seam vertex {v} is not on the mesh "
-                        f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices",
-                        kind="not_on_surface",
-                        key="seam_vertices",
-                    )
-            seam = [int(mesh.merged[v]) for v in seam]
-        cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
-        words = (*log, *mesh.log)
-        return cls.from_cut(cut, mesh, name=name, domain=domain, parameterization=method, log=words)
 
     @classmethod
     def from_cut(
@@ -236,36 +223,22 @@ class Surface:
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
-        """The arrays that :meth:`from_stored` makes the surface of, but for name and domain."""
-        words = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
-        return {
-            "vertices": self.vertices,
-            "faces": self.faces,
-            "uv": self.uv,
-            "source_vertex": self.source_vertex,
-            "cut_vertex": self.cut_vertex,
-            "seam_pairs": self.seam_pairs,
-            "center": self.center,
-            "words": np.frombuffer(words.encode(), dtype=np.uint8),
-        }
+        """The arrays from which :meth:`from_stored` makes the surface, given name and domain."""
+        details = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        return {**arrays, "words": np.frombuffer(details.encode(), dtype=np.uint8)}
 
     @classmethod
     def from_stored(cls, name: str, domain: str | Domain, stored: dict[str, np.ndarray]) -> Surface:
         """The surface of arrays that :meth:`to_stored` gave."""
-        words: dict[str, Any] = json.loads(stored["words"].tobytes())
+        details: dict[str, Any] = json.loads(stored["words"].tobytes())
         return cls(
             name=name,
-            vertices=stored["vertices"],
-            faces=stored["faces"],
-            uv=stored["uv"],
             domain=domain_of(domain),
-            source_vertex=stored["source_vertex"],
-            cut_vertex=stored["cut_vertex"],
-            seam_pairs=stored["seam_pairs"],
-            scale=words["scale"],
-            center=stored["center"],
-            quality=words["quality"],
-            log=(*words["log"], "prepared surface taken from the cache"),
+            scale=details["scale"],
+            quality=details["quality"],
+            log=(*details["log"], "prepared surface taken from the cache"),
+            **{name: stored[name] for name in ARRAYS},
         )
 
     @property
@@ -282,7 +255,7 @@ class Surface:
         return digest.hexdigest()[:32]
 
     def preimages(self, vertex_ids: Sequence[int]) -> np.ndarray:
-        """Points (L, 2) of Ω of vertices of the mesh file; of a seam vertex, its first copy.
+        """Points (L, 2) of Ω for vertices of the mesh file; for a seam vertex, its first copy.
 
         Raises:
             NsmError: a vertex that the file does not have, or that was removed as bad.
@@ -290,8 +263,7 @@ class Surface:
         return self.uv[self._found(vertex_ids)]
 
     def kept(self, vertex_ids: Sequence[int]) -> np.ndarray:
-        """Vertices (L,) of the mesh file as ``source_vertex`` has them: merged ones by the vertex
-        that they were merged with.
+        """Vertices (L,) as in ``source_vertex``: merged ones as the vertex they were merged with.
 
         Raises:
             NsmError: as :meth:`preimages`.
@@ -319,7 +291,7 @@ def as_it_lies(
     domain: str | Domain,
     seam_pairs: np.ndarray | None = None,
 ) -> Surface:
-    """A disc that is laid out already, in its own units and place; nothing is checked."""
+    """A surface from a mesh that is laid out already, not scaled and not checked."""
     return Surface(
         name=name,
         vertices=vertices,
@@ -335,8 +307,21 @@ def as_it_lies(
 
 
 def _numbers(given: Any, what: str) -> list[int]:
-    """Vertex numbers; NsmError for anything else than a list of whole numbers."""
+    """Vertex numbers; NsmError for anything but a list of whole numbers."""
     numbers = listed(given, what)
     if not isinstance(numbers, list):
         raise NsmError(f"{what}: give vertex numbers", kind="wrong_type", key=what)
     return numbers
+
+
+def _merged(seam: list[int], mesh: CleanMesh, name: str) -> list[int]:
+    """Seam vertices of the mesh file as vertices of the cleaned mesh, or NsmError."""
+    for vertex in seam:
+        if not 0 <= vertex < len(mesh.merged) or mesh.merged[vertex] < 0:
+            raise NsmError(
+                f"{name}: seam vertex {vertex} is not on the mesh "
+                f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices",
+                kind="not_on_surface",
+                key="seam_vertices",
+            )
+    return mesh.merged[np.array(seam, dtype=np.int64)].tolist()

@@ -1,4 +1,4 @@
-"""Tutte's embedding: injective whatever the mesh, as long as its boundary is convex."""
+"""Tutte's embedding: injective for every mesh if the boundary is convex."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _mean_values(
 
 
 def factorise(matrix: csr_matrix) -> SuperLU:
-    """LU of a positive definite matrix; pivots stay on the diagonal, or the fill would explode."""
+    """LU of a positive definite matrix, with diagonal pivots, as others would cause large fill."""
     return splu(
         matrix.tocsc(),
         permc_spec="MMD_AT_PLUS_A",

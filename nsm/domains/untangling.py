@@ -1,9 +1,9 @@
-"""Flat meshes whose few flipped triangles are turned back by moving the vertices around them.
+"""Local untangling: turn the few flipped triangles of a flat mesh back.
 
 The energy is that of Garanzha et al. 2021 ("Foldover-free maps in 50 lines of code"): distortion
-over a smoothed determinant, which is finite on flipped triangles and drives their areas up until
-all are positive. It is minimised around each flip alone, over as many rings of triangles as it
-takes; the rest of the mesh stays as it is.
+over a smoothed determinant, finite on flipped triangles, which drives all areas above zero. It is
+minimised around each flip alone, over as many rings of triangles as necessary; the rest of the
+mesh does not move.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from nsm.domains.planar_mesh import cross, flipped, signed_areas
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
-# of the area that a triangle should have: what is smaller could flip by the next rounding
+# of the area that a triangle should have: smaller ones could flip by rounding
 _ROOM = 1e-6
-# of the distance that two neighbours on the boundary have before the map: kept after it
+# of the distance of two boundary neighbours before the map: the least after it
 _GAP = 0.02
 
 
 def untangled(
     rest: np.ndarray, faces: np.ndarray, image: np.ndarray, fixed: np.ndarray
 ) -> np.ndarray:
-    """The image of a flat mesh, with its flipped triangles turned back where that can be done.
+    """The image of a flat mesh, with its flipped triangles turned back where possible.
 
     Args:
         rest: (V, 2) the mesh before it is mapped, no triangle of it flipped.
@@ -35,8 +35,8 @@ def untangled(
         fixed: (V,) mask of vertices that may not move.
 
     Returns:
-        (V, 2): ``image``, but for vertices near a flip, which are as near as can be to where the
-        local affine map has them. Flips that remain are for the caller to count.
+        (V, 2): ``image``, except for vertices near a flip, which follow the local affine map as
+        closely as possible. The caller counts flips that remain.
     """
     image = np.array(image, dtype=np.float64)
     for rings in _RINGS:
@@ -55,7 +55,7 @@ def untangled(
 
 
 def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.ndarray]:
-    """The faces (P, 3) around each group of free vertices that hang together, with a flip each."""
+    """The faces (P, 3) around each connected group of free vertices that has a flip."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     edges = edges[free[edges].all(axis=1)]
     edges = np.concatenate([edges, faces[:, [2, 0]][free[faces[:, [2, 0]]].all(axis=1)]])
@@ -68,7 +68,7 @@ def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.nd
 
 
 def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndarray) -> None:
-    """Move free vertices of a patch (P, 3) within ``image``, if that leaves none of it flipped."""
+    """Move free vertices of a patch (P, 3) in ``image``, if that leaves no flip in the patch."""
     vertices = np.unique(faces)
     affine = _affine_fit(rest[vertices], image[vertices])
     if affine is None:
@@ -111,7 +111,7 @@ def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndar
 
 
 def _affine_fit(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
-    """The matrix (2, 2) that best takes points (N, 2) to others, if it keeps the orientation."""
+    """The least-squares linear map (2, 2) between centred points, or None if it reflects."""
     x, y = before - before.mean(axis=0), after - after.mean(axis=0)
     matrix = np.linalg.lstsq(x, y, rcond=None)[0].T
     return matrix if np.linalg.det(matrix) > 0 else None
@@ -170,11 +170,11 @@ def order_shifts(now: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.nd
     step = np.mod(np.roll(now, -1) - now + 0.5, 1.0) - 0.5
     if round(step.sum()) != 1:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
-    # how far around each point is, less the gaps: what should not decrease; over three turns
+    # how far around each point is, less the gaps, should not decrease; over three turns
     turn = 1.0 - gap.sum()
     once = np.concatenate([[0.0], np.cumsum(step - gap)[:-1]])
     along = np.concatenate([once - turn, once, once + turn])
-    # the circle is opened at a point that all points before it are behind, and all after it ahead
+    # the circle is opened at a point ahead of all before it and behind all after it
     highest = np.maximum.accumulate(along)
     lowest = np.minimum.accumulate(along[::-1])[::-1]
     n = len(now)

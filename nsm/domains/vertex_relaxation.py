@@ -1,8 +1,8 @@
-"""Flat meshes whose vertices move one by one to where their triangles are least distorted.
+"""Relaxation of a flat mesh, vertex by vertex, to less distorted triangles.
 
-The energy is that of :mod:`nsm.domains.sliding`: symmetric Dirichlet, weighted by the
-area on the mesh. Vertices that are no neighbours move at once; a step that would flip a triangle
-or not lower the energy is shortened, or not made.
+The energy is that of :mod:`nsm.domains.sliding`: symmetric Dirichlet, weighted by area on the
+mesh. Vertices that are not neighbours move at once. A step that would flip a triangle or not lower
+the energy is shortened, and in the end skipped.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ _COLOURS = 64
 class Stars:
     """The triangles around some vertices (N,), no two of which are neighbours.
 
-    For each of M corners at them: star (M,), whose it is; b and c (M,), the triangle's others,
-    counter-clockwise; and of its shape on the mesh, a = |g|²A, e = g·g_c A, f = |g_c|²A, with the
-    gradients g, g_c of the hat functions and the area A, and d = 1 / 2A.
+    For each of M corners at them: star (M,), which vertex it belongs to; b and c (M,), the
+    triangle's other vertices, counter-clockwise; and of its shape on the mesh, a = |g|²A,
+    e = g·g_c A, f = |g_c|²A, with the gradients g, g_c of the hat functions and the area A, and
+    d = 1 / 2A.
     """
 
     vertex: np.ndarray
@@ -67,8 +68,8 @@ class Stars:
             1 / double,
         )
 
-    def chosen(self, keep: np.ndarray) -> Stars:
-        """Those of the stars that a mask (N,) keeps."""
+    def subset(self, keep: np.ndarray) -> Stars:
+        """The stars that a mask (N,) keeps."""
         corners = keep[self.star]
         number = np.cumsum(keep) - 1
         parts = (getattr(self, name)[corners] for name in ("b", "c", "a", "e", "f", "d"))
@@ -91,7 +92,7 @@ class Stars:
         return np.bincount(self.star, weights=values, minlength=len(self.vertex))
 
     def derivatives(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Energy (N,), gradient (N, 2) and second derivatives xx, xy, yy (N, 3) as they lie."""
+        """Energy (N,), gradient (N, 2) and second derivatives xx, xy, yy (N, 3) at uv (V, 2)."""
         x, y = uv[self.vertex[self.star]] - uv[self.b], uv[self.c] - uv[self.b]
         det = cross(y, x) * self.d
         q = self._norm(x, y)
@@ -133,27 +134,28 @@ class Freedom:
 def relax(uv: np.ndarray, stars: Stars, freedom: Freedom) -> None:
     """One Newton step of each of the stars' vertices, within uv (V, 2)."""
     energy, gradient, second = stars.derivatives(uv)
-    rim, here = freedom.on_boundary[stars.vertex], uv[stars.vertex]
+    on_boundary, here = freedom.on_boundary[stars.vertex], uv[stars.vertex]
     direction = _newton(gradient, second)
-    if rim.any():
-        t, g, h = freedom.domain.tangents(here[rim]), gradient[rim], second[rim]
+    if on_boundary.any():
+        place, g, h = here[on_boundary], gradient[on_boundary], second[on_boundary]
+        t = freedom.domain.tangents(place)
         along = (g * t).sum(axis=1)
         bend = h[:, 0] * t[:, 0] ** 2 + 2 * h[:, 1] * t[:, 0] * t[:, 1] + h[:, 2] * t[:, 1] ** 2
-        bend = bend + (g * freedom.domain.curvature(here[rim])).sum(axis=1)
+        bend = bend + (g * freedom.domain.curvature(place)).sum(axis=1)
         bend = np.maximum(bend, 0.1 * np.abs(h[:, 0] + h[:, 2]))
-        direction[rim] = -(along / bend)[:, None] * t
+        direction[on_boundary] = -(along / bend)[:, None] * t
     size = np.minimum(1.0, 0.8 * _first_collapse(uv, stars, direction))
     active = np.isfinite(direction).all(axis=1) & ~freedom.held[stars.vertex]
-    some, index = stars.chosen(active), np.flatnonzero(active)
+    some, index = stars.subset(active), np.flatnonzero(active)
     for _ in range(_TRIES):
         if len(index) == 0:
             return
         trial = here[index] + size[index, None] * direction[index]
-        trial = freedom.retract(trial, rim[index])
+        trial = freedom.retract(trial, on_boundary[index])
         better = some.energy(uv, trial) < energy[index]
         uv[some.vertex[better]] = trial[better]
         size[index] *= _SHORTER
-        some, index = some.chosen(~better), index[~better]
+        some, index = some.subset(~better), index[~better]
 
 
 def _newton(gradient: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -188,8 +190,8 @@ def sweep(
 
     Args:
         vertices: (V, 3) the mesh, which should have the area of the domain.
-        uv: (V, 2), not flipped; changed in place.
-        sweeps: how often all are gone through.
+        uv: (V, 2), without flips; changed in place.
+        sweeps: how many times every vertex is relaxed.
     """
     ids, local = topology.renumbered(faces, len(vertices))
     colour = _colours(local[faces], len(ids))

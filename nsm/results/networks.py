@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsm.instantiation import REGISTERED, check_trusted, named_object
-from nsm.maps import AnalyticSurface, Rotated, build_stored
+from nsm.errors import NotRegistered
+from nsm.instantiation import check_trusted, named_object
+from nsm.maps import ANALYTIC, AnalyticSurface, Rotated, build_analytic, build_stored
 
 
 def network_of(
@@ -22,20 +23,27 @@ def network_of(
     and compared with them.
 
     Args:
-        config: settings with ``_target_``, as ``config`` of any map.
+        config: settings, as ``config`` of any map.
         tensors: the network's state.
         trust: modules whose classes the settings may name.
 
     Raises:
         NotTrusted, NsmError: as :func:`nsm.instantiation.check_trusted`.
+        NotRegistered: the name of an analytic surface that is not known.
         ValueError, RuntimeError, TypeError, KeyError: settings and weights do not fit together.
     """
     check_trusted(config, trust)
-    _check_lengths(config, len(tensors))
-    if not _has_closed_form(str(config["_target_"])):
-        with torch.device("meta"):
-            _check_state(build_stored(config, trust).state_dict(), tensors)
-    network = build_stored(config, trust)
+    if "name" in config:
+        if config["name"] not in ANALYTIC:
+            raise NotRegistered("analytic surface", config["name"], "register_analytic")
+        network: nn.Module = build_analytic(dict(config))
+    else:
+        _check_lengths(config, len(tensors))
+        kind = named_object(str(config["_target_"]))
+        if not (inspect.isclass(kind) and issubclass(kind, AnalyticSurface)):
+            with torch.device("meta"):
+                _check_state(build_stored(config, trust).state_dict(), tensors)
+        network = build_stored(config, trust)
     _check_state(network.state_dict(), tensors)
     network.load_state_dict(dict(tensors))
     return network.eval().requires_grad_(False)
@@ -48,13 +56,6 @@ def rotated_map(
     inner = {key.removeprefix("inner."): v for key, v in tensors.items() if key != "rotation"}
     turned = Rotated(network_of(config, inner, trust), tensors["rotation"])
     return turned.eval().requires_grad_(False)
-
-
-def _has_closed_form(target: str) -> bool:
-    """Whether a target computes while it is made, which a sketch cannot: an analytic surface."""
-    kind = named_object(target)
-    closed = inspect.isclass(kind) and issubclass(kind, AnalyticSurface)
-    return closed or target.startswith(f"{REGISTERED}.")
 
 
 def _check_lengths(settings: Any, most: int) -> None:

@@ -1,7 +1,7 @@
 """Artefacts of version 1, as version 2 has them.
 
-Version 1 named activations, encodings and analytic surfaces by short names, and a planar map by the
-domain that it keeps to. Version 2 stores settings with ``_target_``.
+Version 1 named activations and encodings by short names, and a planar map by the domain that it
+keeps to. Version 2 stores settings with ``_target_``.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsm.instantiation import REGISTERED, target_of
-from nsm.maps import ANALYTIC, DiscMap, NeuralMap, PlanarMap, SquareMap
+from nsm.instantiation import REGISTERED
 from nsm.migration import TARGETS, migrated
 from nsm.surfaces.cutting import first_copies
 
-_PLANAR = {None: PlanarMap, "disc": DiscMap, "square": SquareMap}
+_PLANAR = {None: "PlanarMap", "disc": "DiscMap", "square": "SquareMap"}
 # parts of a tensor's name, and settings of a network; the names after these are version 1's too
 _PARTS = {"readout": "linear_skip", "twins": "seam_pairs"}
 _SETTINGS = {"initialisation": "initialization", "readout": "linear_skip"}
@@ -50,17 +49,14 @@ def from_version_1(
 
 def _map(old: dict[str, Any]) -> dict[str, Any]:
     """The settings of a map."""
-    if "name" in old:
-        known = ANALYTIC.get(old["name"])
-        rest = {key: value for key, value in old.items() if key != "name"}
-        target = target_of(known) if isinstance(known, type) else f"{REGISTERED}.{old['name']}"
-        return {"_target_": target, **rest}
+    if "name" in old:  # an analytic surface
+        return old
     if "onto" in old:
         network = {key: value for key, value in old.items() if key != "onto"}
-        return {"_target_": target_of(_PLANAR[old["onto"]]), "network": _map(network)}
+        return {"_target_": f"nsm.maps.{_PLANAR[old['onto']]}", "network": _map(network)}
     network = {_SETTINGS.get(key, key): value for key, value in old.items()}
     for part, default in (("activation", "softplus"), ("encoding", "identity")):
         named = dict(old.get(part) or {"name": default})
         name = str(named.pop("name"))
         network[part] = {"_target_": TARGETS[part].get(name, f"{REGISTERED}.{name}"), **named}
-    return {"_target_": target_of(NeuralMap), **network}
+    return {"_target_": "nsm.maps.NeuralMap", **network}

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from nsm.domains import Disc, Surface, domain, embedding
-from nsm.domains.coarse_to_fine import laid_out
+from nsm.domains.coarse_to_fine import embed_coarse_to_fine
 from nsm.domains.decimation import Rings, coarsen, present_faces, undo
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.tutte import tutte
@@ -99,7 +99,7 @@ def test_a_bad_start_is_put_back_without_flips():
     loop = topology.boundary_loops(faces)[0]
     boundary = Disc().place_boundary(vertices, loop)
     none = np.zeros(len(vertices), dtype=bool)
-    uv = laid_out(
+    uv = embed_coarse_to_fine(
         vertices, faces, loop, boundary, Disc(), none, lambda v, f, r, b, h: tutte(v, f, r, b), 300
     )
     assert uv is not None
@@ -131,7 +131,7 @@ def test_as_good_as_at_once(name, monkeypatch):
 
 def test_what_does_not_carry_over_is_laid_out_at_once(monkeypatch):
     monkeypatch.setattr(embedding, "LARGE", 500)
-    monkeypatch.setattr(embedding, "laid_out", lambda *_: None)
+    monkeypatch.setattr(embedding, "embed_coarse_to_fine", lambda *_: None)
     vertices, faces = bumpy(20)
     surface = Surface.from_arrays(vertices, faces)
     assert any("laid out at once" in line for line in surface.log)
