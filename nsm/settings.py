@@ -425,6 +425,4 @@ def defaults() -> dict[str, Any]:
 def parts() -> dict[str, type]:
     """The classes of the nested plain settings by key: surface, phi, trainer, ..."""
     kinds = {key: parameter.kind for key, parameter in parameters(Settings)[0].items()}
-    return {
-        key: kind for key, kind in kinds.items() if inspect.isclass(kind) and is_dataclass(kind)
-    }
+    return {key: k for key, k in kinds.items() if inspect.isclass(k) and is_dataclass(k)}

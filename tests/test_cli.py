@@ -155,12 +155,12 @@ def test_classes_of_the_current_folder_and_other_libraries(here, defects, tmp_pa
 
 
 def test_a_run_of_an_older_version_is_resumed(here, tmp_path):
-    folder = Path(shutil.copytree(OLDER / "interrupted", tmp_path / "older"))
-    result = here(f"resume={folder}")
+    shutil.copytree(OLDER / "interrupted", tmp_path, dirs_exist_ok=True)
+    result = here(f"resume={tmp_path}")
     assert result.returncode == 0, result.stderr
-    stored = yaml.safe_load((folder / "config.yaml").read_text())
+    stored = yaml.safe_load((tmp_path / "config.yaml").read_text())
     assert stored["activation"]["_target_"].startswith("nsm.maps.activations.")
-    figures = json.loads((folder / "metrics.json").read_text())
+    figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["steps"] == stored["trainer"]["max_steps"]
 
 
