@@ -38,7 +38,9 @@ def run(config: DictConfig, folder: Path) -> None:
     with folder_lock(folder):
         resuming = config.resume is not None
         if resuming:
-            config = stored_config(folder, config.trust)
+            trust = list(config.trust)  # what the stored configuration trusts does not count
+            config = stored_config(folder, trust)
+            config.trust = trust
         run_task(config, folder, resuming=resuming)
 
 
@@ -160,7 +162,7 @@ def finish(
         figures["batched"] = len(ensemble.each)
     loggers = loggers_of(trainer.loggers, index)
     log_figures(loggers, task.settings, result.metrics, trainer.global_step)
-    words = {
+    summary = {
         "surface": task.surface.name,
         "steps": trainer.global_step,
         "seconds": round(time.monotonic() - started, 2),
@@ -170,7 +172,7 @@ def finish(
         **figures,
         "metrics": result.metrics,
     }
-    atomic_write(run.folder / "metrics.json", as_json(words))
+    atomic_write(run.folder / "metrics.json", as_json(summary))
     if task.table is not None:
         task.console.print(task.table(result.metrics))
     if not is_passing(run.folder):

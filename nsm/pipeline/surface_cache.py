@@ -68,7 +68,7 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
         NsmError: a mesh, neural surface or setting that cannot be used.
     """
     if config.phi.path is not None:
-        phi = load_surface(config.phi.path)
+        phi = load_surface(config.phi.path, trust=config.trust)
         if phi.surface.domain != domain(config.domain):
             raise NsmError(
                 f"{config.phi.path}: its domain is the {phi.surface.domain}, not the "
