@@ -22,7 +22,7 @@ from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
 from nsm.results.files import as_json
 from nsm.results.loggers import check_packages, log_figures, loggers_of
-from nsm.run_directories import is_passing
+from nsm.run_directories import is_temporary
 from nsm.tasks.ensemble import Ensemble
 
 
@@ -175,6 +175,6 @@ def finish(
     atomic_write(run.folder / "metrics.json", as_json(summary))
     if task.table is not None:
         task.console.print(task.table(result.metrics))
-    if not is_passing(run.folder):
+    if not is_temporary(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result
