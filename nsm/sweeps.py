@@ -78,8 +78,10 @@ def swept_keys(arguments: Iterable[str], params: Mapping[str, Any] | None) -> li
 
 
 def sweep_folder(task: str, arguments: Sequence[str], params: Mapping[str, Any] | None) -> str:
-    """``outputs/TASK/sweep-WHAT``, with a hash of the fixed settings but not of the swept values, so
-    that a sweep can be widened in its folder."""
+    """``outputs/TASK/sweep-WHAT`` with a hash of the fixed settings.
+
+    The swept values have no part in it, so that a sweep can be widened in its folder.
+    """
     preset = [one.split("=")[1] for one in arguments if one.startswith("sweep=")]
     swept = [o.get_key_element() for o in overrides_of(arguments, {}) if o.is_sweep_override()]
     name = _name([*preset, *(key.split(".")[-1] for key in swept)]) or "one"
