@@ -11,7 +11,7 @@ from nsm.domains import Surface, domain
 
 
 def keep_absolute(config: DictConfig) -> None:
-    """Make the path of the group ``surface`` absolute: a run can then be resumed from any folder."""
+    """Make the path of the group ``surface`` absolute, to resume the run from any folder."""
     if config.surface.path is not None:
         config.surface.path = os.path.abspath(config.surface.path)
 
