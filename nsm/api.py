@@ -27,7 +27,7 @@ from nsm.results import (
     load_surface,
     load_surface_map,
 )
-from nsm.run_directories import passing_folder
+from nsm.run_directories import temporary_folder
 from nsm.sweeps import is_complete
 
 
@@ -265,7 +265,7 @@ class _Request:
                 return
             if "logger" not in self.settings and not any("logger" in o for o in overrides):
                 overrides.append("logger=none")
-            with passing_folder() as temporary:
+            with temporary_folder() as temporary:
                 config = compose_config([*overrides, "artefacts=false"], self.settings)
                 yield config, Path(temporary)
         except OSError as error:

@@ -188,7 +188,7 @@ def _sum_up() -> int:
     failed = [outcome for outcome in OUTCOMES if outcome.error is not None]
     print(summary(OUTCOMES))
     for outcome in failed:
-        _say(f"failed: {' '.join(outcome.words) or outcome.folder}: {outcome.error}")
+        _say(f"failed: {' '.join(outcome.overrides) or outcome.folder}: {outcome.error}")
     return 1 if failed else 0
 
 

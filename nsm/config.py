@@ -21,21 +21,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nsm.errors import NsmError
 from nsm.migration import check_override, migrated
-from nsm.settings import PRECISIONS, defaults
+from nsm.settings import defaults
 from nsm.sweeps import sweep_folder
-
-__all__ = [
-    "GROUPS",
-    "PRECISIONS",
-    "checked",
-    "compose_config",
-    "composed",
-    "conf_folder",
-    "prepared_overrides",
-    "read_config",
-    "register",
-    "setting_error",
-]
 
 # groups of which an option is one ``_target_``, and those that hold several of them by name
 GROUPS = (
@@ -198,7 +185,7 @@ def _is_file(value: str) -> bool:
     from nsm.surfaces.loading import EXTENSIONS
 
     known = (conf_folder() / "surface" / f"{value}.yaml").is_file()
-    return not known and ("/" in value or "\\" in value or Path(value).suffix in EXTENSIONS)
+    return not known and ("/" in value or "\\" in value or Path(value).suffix.lower() in EXTENSIONS)
 
 
 def _readable(override: str) -> bool:

@@ -25,7 +25,7 @@ _PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
 _DEFAULT = re.compile(r"  - (?:override )?([^\s:]+): (\S+)$")
 # whose docstrings say what the settings of these groups are
 _DATACLASSES: dict[str, tuple[type, ...]] = {
-    "loss_weights": (plain.OverfitWeights, plain.PairWeights),
+    "loss_weights": (plain.OverfitWeights, plain.ParamWeights, plain.PairWeights),
     "constraints": (plain.ParamConstraints, plain.PairConstraints),
 }
 
@@ -92,6 +92,10 @@ def option_settings(group: str, name: str, run: Mapping[str, Any] | None = None)
         return [s for k, part in node.items() for s in target_settings(f"{key}.{k}", group, part)]
     if "_target_" in node:
         return target_settings(key, group, node)
+    for kind in _DATACLASSES.get(group, ()):
+        known = plain.parameters(kind)[0]
+        if {k for k, p in known.items() if p.required} <= set(node) <= set(known):
+            node = {k: node.get(k, p.default) for k, p in known.items()}
     return [_setting(f"{key}.{k}", value) for k, value in node.items()]
 
 

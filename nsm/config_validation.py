@@ -123,7 +123,7 @@ def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, 
             result[k] = value
         elif k in known:
             result[k] = _fit(dotted, value, known[k])
-        elif others:
+        elif others and (dotted in given or not retargeted):
             result[k] = _nested(dotted, value)
         elif dotted in given or not (retargeted or dotted in _FROM_INITIALIZATION):
             raise unknown_setting(dotted, list(known), name)
@@ -142,8 +142,14 @@ def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, 
 
 
 def takes(group: str, thing: Any) -> tuple[dict[str, Parameter], bool]:
-    """The settings that a class or function takes in a group, and whether it takes any others."""
+    """The settings that a class or function takes in a group, and whether it takes any others.
+
+    nsm's own classes name all that they take, though a base of theirs may accept others.
+    """
     known, others = parameters(thing)
+    if getattr(thing, "__init__", None) is torch.nn.Module.__init__:  # which takes nothing
+        others = False
+    others = others and not str(thing.__module__).startswith("nsm.")
     supplied = SUPPLIED.get(group, ())
     return {k: p for k, p in known.items() if k not in supplied} | EXTRA.get(group, {}), others
 
@@ -275,8 +281,8 @@ def _build(settings: dict[str, Any]) -> None:
             key="sampler.domain_share",
         )
     with _same_random_numbers():
-        with _blamed("map"):
-            parts = {key: settings[key] for key in ("map", "activation", "encoding")}
+        parts = {key: settings[key] for key in ("map", "activation", "encoding")}
+        with _blamed("map", parts):
             network = build_network(**parts)
         with _blamed("optimizer"):
             optimizer = build_optimizer(network, settings["optimizer"])
@@ -301,12 +307,19 @@ def _same_random_numbers() -> Iterator[None]:
 
 
 @contextmanager
-def _blamed(group: str) -> Iterator[None]:
-    """Name the group in what is said of its values; other exceptions are defects and pass."""
+def _blamed(group: str, parts: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Name the group in what is said of its values; other exceptions are defects and pass.
+
+    Args:
+        group: what is made.
+        parts: groups that it is made of; the one whose target refuses its values is named.
+    """
     try:
         yield
     except NsmError as error:
         text = str(error)
+        for name, node in (parts or {}).items():
+            group = name if node["_target_"] == error.key else group
         text = text if text.startswith("setting ") else f"setting {group}: {text}"
         key = error.key if error.key and error.key.startswith(f"{group}.") else group
         raise NsmError(text, kind=error.kind, key=key) from error

@@ -18,12 +18,13 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from nsm.errors import NotTrusted, NsmError
+from nsm.errors import NotRegistered, NotTrusted, NsmError
 
 # packages and modules whose classes only compute: making one reads and writes no file; loggers get
 # their folder from the run
+_LOGGERS = ("nsm.results.loggers",)
 _OURS = (
-    *("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", "nsm.results.loggers"),
+    *("nsm.maps", "nsm.energies", "nsm.domains", "nsm.tasks", "nsm.data", *_LOGGERS),
     *(f"nsm.pipeline.{task}" for task in ("overfit", "param", "pair_map", "collection_map")),
 )
 _TORCH = ("torch.nn.modules.activation", "torch.optim")
@@ -135,8 +136,10 @@ def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
     """Refuse stored settings that would run code which is not to be trusted.
 
     Raises:
-        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within.
-        NsmError: ``interpolation``: a text with ``${``, which may make a target of another text.
+        NotTrusted: a target that :func:`is_trusted` refuses, anywhere within; a logger that names
+            its folder, or any positional arguments.
+        NotRegistered: a registered object that this process does not know.
+        NsmError: ``interpolation``: a text with ``${``, which could become a target later.
     """
     trust = _modules(trust)
     if OmegaConf.is_config(config):
@@ -145,8 +148,13 @@ def check_trusted(config: Any, trust: Iterable[str] = ()) -> None:
         message = f"{config[:80]!r} is an interpolation, which stored settings may not hold"
         raise NsmError(message, kind="interpolation")
     if isinstance(config, Mapping):
-        if "_target_" in config and not is_trusted(str(config["_target_"]), trust):
-            raise NotTrusted(str(config["_target_"]))
+        target = str(config.get("_target_", ""))
+        writes = _within(target, _LOGGERS) and "folder" in config  # anywhere on the disk
+        if "_args_" in config or writes or ("_target_" in config and not is_trusted(target, trust)):
+            module, _, name = target.rpartition(".")
+            if module == REGISTERED:
+                raise NotRegistered("object", name, "register_...")
+            raise NotTrusted(target)
         for item in config.items():
             check_trusted(item, trust)
     elif isinstance(config, (list, tuple)):

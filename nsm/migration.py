@@ -97,7 +97,7 @@ def check_override(key: str, value: str) -> None:
         "logger.kinds": "logger=tensorboard, csv, both, wandb, mlflow or none",
         "trainer": "trainer.SETTING=VALUE, as it is no group any more",
     }.get(bare)
-    if last == "name" and group in _NAMED:
+    if last == "name" and value in TARGETS.get(group, ()):
         new = f"{group}={value}"
     for option in value.split(","):
         new = "=".join(OPTIONS[bare, option]) if (bare, option) in OPTIONS else new

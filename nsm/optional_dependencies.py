@@ -1,4 +1,4 @@
-"""Packages that come with an extra of nsm, and not without it."""
+"""Packages that an extra of nsm installs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from nsm.errors import NsmError
 
 
 def needed(package: str, what: str, extra: str | None = None) -> Any:
-    """A package of an extra, which is called as the package is unless it is named.
+    """Import a package of an extra.
+
+    Args:
+        package: its name.
+        what: what needs it, for the message.
+        extra: the name of the extra, by default that of the package.
+
 
     Raises:
         NsmError: it is not installed.
@@ -17,5 +23,7 @@ def needed(package: str, what: str, extra: str | None = None) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        mend = f"pip install 'nsm[{extra or package}]'"
-        raise NsmError(f"{what} needs {package}: {mend}") from error
+        command = f"pip install 'nsm[{extra or package}]'"
+        raise NsmError(
+            f"{what} needs {package}: {command}", kind="missing_package", key=package
+        ) from error

@@ -1,4 +1,4 @@
-"""Folders that nothing came of, and such as pass away."""
+"""Temporary run folders, and empty ones."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-_PASSING = "nsm-passing-"
+_PREFIX = "nsm-run-"
 
 
-def passing_folder() -> tempfile.TemporaryDirectory[str]:
-    """A folder for a run of which nothing is kept."""
-    return tempfile.TemporaryDirectory(prefix=_PASSING)
+def temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    """A temporary folder for a run of which nothing is kept."""
+    return tempfile.TemporaryDirectory(prefix=_PREFIX)
 
 
-def is_passing(folder: Path) -> bool:
-    """Whether a folder is one of :func:`passing_folder`: no use to name it."""
-    return folder.name.startswith(_PASSING)
+def is_temporary(folder: Path) -> bool:
+    """Whether a folder is one of :func:`temporary_folder`, which messages need not name."""
+    return folder.name.startswith(_PREFIX)
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove folders, each the one around the one before, up to the first that is not empty."""
+    """Remove folders, each the parent of the one before, up to the first that is not empty."""
     for folder in folders:
         if not folder.is_dir() or any(folder.iterdir()):
             return

@@ -164,8 +164,9 @@ def parameters(thing: Callable[..., Any]) -> tuple[dict[str, Parameter], bool]:
             others = True
         elif parameter.kind is not parameter.VAR_POSITIONAL:
             default = parameter.default
-            if type(default).__name__ == "_HAS_DEFAULT_FACTORY_CLASS":
-                default = next(f for f in fields(thing) if f.name == name).default_factory()
+            if type(default).__name__ == "_HAS_DEFAULT_FACTORY_CLASS":  # of a dataclass
+                made: Any = next(f for f in fields(thing) if f.name == name)  # type: ignore[arg-type]
+                default = made.default_factory()
             known[name] = Parameter(hints.get(name, Any), default)
     return known, others
 
@@ -424,4 +425,4 @@ def defaults() -> dict[str, Any]:
 def parts() -> dict[str, type]:
     """The classes of the nested plain settings by key: surface, phi, trainer, ..."""
     kinds = {key: parameter.kind for key, parameter in parameters(Settings)[0].items()}
-    return {key: kind for key, kind in kinds.items() if is_dataclass(kind)}
+    return {key: k for key, k in kinds.items() if inspect.isclass(k) and is_dataclass(k)}

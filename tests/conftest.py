@@ -35,18 +35,19 @@ def shared_meshes() -> Path:
 
 @pytest.fixture
 def here(tmp_path, monkeypatch, capfd):
-    """Run the command within this process, in a folder of its own: imports take seconds."""
+    """Run the command within this process, in a temporary folder: imports take seconds."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(sys, "path", [*sys.path])  # the command adds its folder
 
-    def call(*words: str) -> subprocess.CompletedProcess:
-        monkeypatch.setattr(sys, "argv", ["nsm", *words])
+    def call(*arguments: str) -> subprocess.CompletedProcess:
+        monkeypatch.setattr(sys, "argv", ["nsm", *arguments])
         status = 0
         try:
             cli.main()
         except SystemExit as stop:
             status = int(stop.code or 0)
         out, err = capfd.readouterr()
-        return subprocess.CompletedProcess(words, status, out, err)
+        return subprocess.CompletedProcess(arguments, status, out, err)
 
     return call

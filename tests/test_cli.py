@@ -1,17 +1,21 @@
 """The command: its first word, flags, and the answers to mistakes."""
 
 import json
+import shutil
 import sys
 import types
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
+import yaml
 from tiny import TRAINING
 
 import nsm
 from nsm import cli
 from nsm.arguments import Arguments
 
+OLDER = Path(__file__).parent / "data_v1"
 SQUARE = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
 DEFECTS = """
 import pytorch_lightning as pl
@@ -50,11 +54,10 @@ def echo(monkeypatch):
 
 
 @pytest.fixture
-def defects(tmp_path, monkeypatch):
+def defects(tmp_path):
     """The user's module ``defects_for_test`` in the current folder."""
     (tmp_path / "defects_for_test.py").write_text(DEFECTS)
     (tmp_path / "patch.off").write_text(SQUARE)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     yield
     sys.modules.pop("defects_for_test", None)
 
@@ -149,6 +152,16 @@ def test_classes_of_the_current_folder_and_other_libraries(here, defects, tmp_pa
     )
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "run" / "csv" / "metrics.csv").is_file()
+
+
+def test_a_run_of_an_older_version_is_resumed(here, tmp_path):
+    shutil.copytree(OLDER / "interrupted", tmp_path, dirs_exist_ok=True)
+    result = here(f"resume={tmp_path}")
+    assert result.returncode == 0, result.stderr
+    stored = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert stored["activation"]["_target_"].startswith("nsm.maps.activations.")
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["steps"] == stored["trainer"]["max_steps"]
 
 
 def test_public_names_are_listed():

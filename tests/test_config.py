@@ -292,6 +292,7 @@ def test_a_mistake_names_the_nearest():
         ("optimizer.weight_decay=1", "optimizer.weight_decay", 1.0),
         ("+optimizer.weight_decay=1", "optimizer.weight_decay", 1.0),
         ("activation._target_=torch.nn.Mish", "activation.beta", None),
+        ("activation._target_=torch.nn.Tanh", "activation.beta", None),
         ("activation._target_=torch.nn.CELU activation.alpha=2", "activation.alpha", 2.0),
         (
             "scheduler._target_=torch.optim.lr_scheduler.StepLR scheduler.step_size=5",
@@ -443,7 +444,7 @@ def test_a_file_that_is_no_configuration_is_refused(text, tmp_path):
     assert (error.value.kind, error.value.key) == ("damaged_file", str(tmp_path / "config.yaml"))
 
 
-def test_a_stored_target_of_others_is_refused(tmp_path):
+def test_a_stored_target_of_others_is_refused(tmp_path, mine):
     file = tmp_path / "config.yaml"
     config = compose_config(["activation._target_=torch.nn.Mish"])
     check_trusted(OmegaConf.to_container(config))
@@ -452,7 +453,7 @@ def test_a_stored_target_of_others_is_refused(tmp_path):
         "subprocess.Popen",
         "nsm.cli.main",
         "torch.hub.load",
-        "mine.Energy",
+        "mine_for_test.Term",
     ):
         config.activation = {"_target_": target}
         file.write_text(OmegaConf.to_yaml(config))
@@ -460,7 +461,7 @@ def test_a_stored_target_of_others_is_refused(tmp_path):
         with pytest.raises(NotTrusted) as error:
             check_trusted(stored)
         assert error.value.key == target.split(".")[0]
-    check_trusted(stored, trust=["mine"])
+    check_trusted(stored, trust=["mine_for_test"])
 
 
 def test_a_users_own_files(tmp_path, here):

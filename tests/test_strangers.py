@@ -131,7 +131,7 @@ def test_pipes_are_not_waited_for(copy):
     for load, file in ((nsm.load, copy), (read_landmarks, copy / "marks.vts")):
         with pytest.raises(NsmError) as refused:
             load(file)
-        assert refused.value.kind == "unreadable_file"
+        assert refused.value.kind == "not_a_file"
 
 
 @pytest.mark.parametrize(
@@ -260,11 +260,11 @@ def test_a_stored_configuration_makes_nothing_by_target(copy, here):
 
 def test_a_name_is_no_interpolation(tmp_path, here, monkeypatch):
     """A file may be called so; its name must not tell what the environment holds."""
-    monkeypatch.setenv("SECRET", "told")
+    monkeypatch.setenv("SECRET", "hidden")
     (tmp_path / "${oc.env:SECRET}.obj").write_text("v 0 0 0\n")
     result = here('surface.path="\\${oc.env:SECRET}.obj"')
     assert result.returncode == 2
-    assert "told" not in result.stderr
+    assert "hidden" not in result.stderr
 
 
 def changed(folder: Path, **metadata) -> None:
@@ -393,7 +393,7 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "mesh.obj")
     with pytest.raises(NsmError) as refused:
         load_mesh(tmp_path / "mesh.obj")
-    assert refused.value.kind == "unreadable_file"
+    assert refused.value.kind == "not_a_file"
 
 
 def test_an_array_that_lies_makes_no_room(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 from tiny import TRAINING
 
-from hydra_plugins.nsm_sweeps.launchers import _told
+from hydra_plugins.nsm_sweeps.launchers import run_in_process
 from nsm.config import compose_config, conf_folder
 from nsm.sweeps import job_folder, overrides_of, sweep_folder
 
@@ -74,10 +74,10 @@ def test_what_an_interruption_left_is_gone_on_with(tmp_path, here):
 def test_jobs_in_one_batch(tmp_path, here):
     result = here("-m", *TINY, "hydra/launcher=batched", "seed=0,1")
     assert result.returncode == 0, result.stderr
-    assert "next, 2 in one batch: seed=0; seed=1" in result.stdout
+    assert "2 in one batch" in result.stdout
     assert "2 jobs" in result.stdout and "2 complete" in result.stdout
     told = [json.loads((place / "metrics.json").read_text()) for place in jobs(tmp_path).values()]
-    assert [words["together"] for words in told] == [2, 2]
+    assert [figures["batched"] for figures in told] == [2, 2]
 
 
 def test_settings_of_all_jobs_are_checked_before_the_first_starts(tmp_path, here):
@@ -124,7 +124,7 @@ def test_a_process_tells_why_its_job_failed(tmp_path, monkeypatch, capfd):
     config = compose_config([*TINY, "surface.path=bad.off"])
     place = tmp_path / "job"
     place.mkdir()
-    told = _told(place, OmegaConf.to_container(config), str(place), str(tmp_path))
+    told = run_in_process(place, OmegaConf.to_container(config), str(place), str(tmp_path))
     assert told[0] == place and told[1] is not None and "bad.off" in told[1]
     assert told[1] in (place / "error.txt").read_text()
     assert capfd.readouterr().out == ""
@@ -154,7 +154,7 @@ def test_presets_sweep_what_they_say():
 
     for file in sorted((conf_folder() / "sweep").glob("*.yaml")):
         params = yaml.safe_load(file.read_text())["hydra"]["sweeper"]["params"]
-        task = "pair_map" if file.stem == "lambda_seam" else "overfit"
+        task = "pair_map" if file.stem == "seam_weight" else "overfit"
         for override in overrides_of([], params):
             values = list(override.sweep_string_iterator())
             assert len(set(values)) == len(values) > 1

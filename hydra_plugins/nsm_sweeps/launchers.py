@@ -48,7 +48,7 @@ class SweepLauncher(Launcher):
         """
         jobs = [self._job(overrides) for overrides in job_overrides]
         outcomes = {
-            job.folder: Outcome(job.words, job.folder, before=True)
+            job.folder: Outcome(job.overrides, job.folder, before=True)
             for job in jobs
             if is_complete(job.folder)
         }
@@ -56,7 +56,7 @@ class SweepLauncher(Launcher):
             self._say(f"complete before: {_label(outcome)}")
         waiting = {job.folder: job for job in jobs if job.folder not in outcomes}
         for number, (job, error) in enumerate(self.run(list(waiting.values())), start=1):
-            outcome = Outcome(job.words, job.folder, error)
+            outcome = Outcome(job.overrides, job.folder, error)
             outcomes[job.folder] = outcome
             became = f"failed: {_label(outcome)}: {error}" if error else f"done: {_label(outcome)}"
             self._say(f"[{number}/{len(waiting)}] {became}")
@@ -72,7 +72,7 @@ class SweepLauncher(Launcher):
 
         hydra = self.config.hydra
         keys = swept_keys(hydra.overrides.task, hydra.sweeper.params)
-        words = tuple(word for word in overrides if word.split("=")[0] in keys)
+        own = tuple(one for one in overrides if one.split("=")[0] in keys)
         config = self.loader.load_sweep_config(self.config, list(overrides))
         with open_dict(config):
             del config["hydra"]
@@ -80,9 +80,9 @@ class SweepLauncher(Launcher):
             settings: Any = OmegaConf.to_container(checked(config, overrides))
         except NsmError as error:
             raise NsmError(
-                f"{' '.join(words) or 'the job'}: {error}", kind=error.kind, key=error.key
+                f"{' '.join(own) or 'the job'}: {error}", kind=error.kind, key=error.key
             ) from error
-        return Job(settings, job_folder(Path(hydra.sweep.dir), settings, words), words)
+        return Job(settings, job_folder(Path(hydra.sweep.dir), settings, own), own)
 
     def _say(self, line: str) -> None:
         print(line, flush=True)
@@ -95,7 +95,7 @@ class Serial(SweepLauncher):
         from nsm.pipeline.sweep_jobs import run_job
 
         for job in jobs:
-            self._say(f"next: {' '.join(job.words) or job.folder.name}")
+            self._say(f"next: {' '.join(job.overrides) or job.folder.name}")
             yield job, run_job(*job.call, log=False)
 
 
@@ -121,7 +121,7 @@ class Batched(SweepLauncher):
             )
         for numbers in batches([job.settings for job in jobs], self.at_once):
             batch = [jobs[number] for number in numbers]
-            names = [" ".join(job.words) or job.folder.name for job in batch]
+            names = [" ".join(job.overrides) or job.folder.name for job in batch]
             if len(batch) == 1:
                 self._say(f"next: {names[0]}")
                 yield batch[0], run_job(*batch[0].call, log=False)
@@ -300,10 +300,10 @@ def run_in_process(
 
 
 def _label(outcome: Outcome) -> str:
-    return " ".join(outcome.words) or outcome.folder.name
+    return " ".join(outcome.overrides) or outcome.folder.name
 
 
 def _returned(outcome: Outcome) -> JobReturn:
-    value = JobReturn(overrides=outcome.words, status=JobStatus.COMPLETED)
+    value = JobReturn(overrides=outcome.overrides, status=JobStatus.COMPLETED)
     value.return_value = outcome
     return value

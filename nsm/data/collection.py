@@ -14,6 +14,7 @@ from nsm.data.sampling import SurfaceSampler
 from nsm.data.shard import Shard
 from nsm.data.surface import HELD_OUT_BATCH, HELD_OUT_SEED, Steps, ready
 from nsm.domains import Surface
+from nsm.settings import Count
 
 
 class CollectionData(pl.LightningDataModule):
@@ -35,9 +36,9 @@ class CollectionData(pl.LightningDataModule):
         rotations: Tensor,
         sampler: Draws | None = None,
         *,
-        batch_size: int,
-        steps_per_epoch: int,
-        held_out: int,
+        batch_size: Count,
+        steps_per_epoch: Count,
+        held_out: Count,
         seed: int = 0,
     ) -> None:
         super().__init__()

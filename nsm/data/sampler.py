@@ -7,6 +7,7 @@ from typing import Protocol
 import torch
 
 from nsm.data.sampling import Samples, SurfaceSampler, join
+from nsm.settings import Count, Share
 
 
 class Draws(Protocol):
@@ -33,7 +34,7 @@ class Sampler:
     """
 
     def __init__(
-        self, vertex_share: float = 0.0, domain_share: float = 0.0, pool: int | None = None
+        self, vertex_share: Share = 0.0, domain_share: Share = 0.0, pool: Count | None = None
     ) -> None:
         for name, share in (("vertex_share", vertex_share), ("domain_share", domain_share)):
             if not 0 <= share <= 1:

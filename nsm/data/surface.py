@@ -14,6 +14,7 @@ from nsm.data.sampler import Draws, Sampler
 from nsm.data.sampling import Samples, SurfaceSampler
 from nsm.data.shard import Shard
 from nsm.domains import Surface
+from nsm.settings import Count
 
 # Held-out points come from their own stream, whatever the training's seed.
 HELD_OUT_SEED = 7_919
@@ -70,9 +71,9 @@ class SurfaceData(pl.LightningDataModule):
         surface: Surface,
         sampler: Draws | None = None,
         *,
-        batch_size: int = 4096,
-        steps_per_epoch: int = 250,
-        held_out: int = 16_384,
+        batch_size: Count = 4096,
+        steps_per_epoch: Count = 250,
+        held_out: Count = 16_384,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -123,7 +124,7 @@ class EnsembleData(pl.LightningDataModule):
         sampler: Draws,
         seeds: Sequence[int],
         *,
-        steps_per_epoch: int,
+        steps_per_epoch: Count,
         **settings: Any,
     ) -> None:
         super().__init__()

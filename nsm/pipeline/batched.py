@@ -21,7 +21,7 @@ from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.instantiation import made, target_of
 from nsm.maps.networks import SKIPS
-from nsm.pipeline.configured_surface import configured_surface, report_surface
+from nsm.pipeline.configured_surface import configured_surface, keep_absolute, report_surface
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.overfit import OverfitTask
 from nsm.pipeline.runner import built, finish, make_task
@@ -223,6 +223,7 @@ def _ready(
     if is_complete(place):  # another sweep has been at it
         return None
     run = job_run(settings, place)
+    keep_absolute(run.config)
     key = f"{run.config.surface} {run.config.domain}"
     if key not in surfaces:
         surfaces[key] = configured_surface(run.config)

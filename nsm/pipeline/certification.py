@@ -6,13 +6,13 @@ from typing import Any
 
 import pytorch_lightning as pl
 
-from nsm.config import PRECISIONS
 from nsm.errors import NsmError
 from nsm.pipeline.process_state import matmul_precision
 from nsm.pipeline.task import Task
 from nsm.pipeline.training import lightning_trainer
 from nsm.results.certificate import verdict
 from nsm.results.divergence_guard import DivergenceGuard
+from nsm.settings import PRECISIONS
 
 _SHARE = 10  # a further training has this part of the training's steps
 _OVERLAPS = "boundary_self_intersections"  # of a free boundary

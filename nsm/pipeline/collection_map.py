@@ -59,7 +59,8 @@ class CollectionMapTask(Task):
                 key="surfaces",
             )
         shapes = [
-            read_shape(surface, self.domain, f"surfaces[{k}]") for k, surface in enumerate(surfaces)
+            read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
+            for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
         ids = landmark_vertices(landmarks, shapes)

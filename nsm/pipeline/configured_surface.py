@@ -10,16 +10,20 @@ from rich.console import Console
 from nsm.domains import Surface, domain
 
 
+def keep_absolute(config: DictConfig) -> None:
+    """Make the path of the group ``surface`` absolute, to resume the run from any folder."""
+    if config.surface.path is not None:
+        config.surface.path = os.path.abspath(config.surface.path)
+
+
 def configured_surface(config: DictConfig) -> Surface:
-    """The surface of the group ``surface``, prepared; its path becomes absolute, so that a run can
-    be resumed from any folder.
+    """The surface of the group ``surface``, prepared.
 
     Raises:
         NsmError: a mesh that cannot be used.
     """
+    keep_absolute(config)
     settings = config.surface
-    if settings.path is not None:
-        settings.path = os.path.abspath(settings.path)
     return Surface.load(
         settings.path if settings.path is not None else settings.name,
         domain=domain(config.domain),

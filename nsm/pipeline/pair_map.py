@@ -52,7 +52,7 @@ class PairMapTask(Task):
         self.keep_absolute("source", "target", "landmarks", "attributes")
         settings = self.settings
         shapes = [
-            read_shape(settings[key] if end is None else end, self.domain, key)
+            read_shape(settings[key] if end is None else end, self.domain, key, self.config.trust)
             for key, end in (("source", given.source), ("target", given.target))
         ]
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from nsm.surfaces.loading import load_mesh
 Shape = NeuralSurface | Mesh
 
 
-def read_shape(given: Any, domain: Domain, key: str) -> Shape:
+def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) -> Shape:
     """The surface that a user names.
 
     Args:
@@ -42,6 +42,7 @@ def read_shape(given: Any, domain: Domain, key: str) -> Shape:
             analytic surface, as ``{"name": ..., parameters}`` or, for a target, by its name.
         domain: on which the surface has to lie.
         key: the setting's name, for messages.
+        trust: modules whose classes a run folder may name, beside those of nsm and torch.
 
     Raises:
         NsmError: nothing of these, or a surface that cannot be read or lies on another domain.
@@ -66,7 +67,7 @@ def read_shape(given: Any, domain: Domain, key: str) -> Shape:
     else:
         name = str(given)
         if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
-            ready = load_surface(name)
+            ready = load_surface(name, trust=trust)
         elif name in ANALYTIC and key == "target":  # some are also meshes of the catalogue
             return analytic_surface({"name": name}, domain)
         elif Path(name).suffix or os.sep in name or Path(name).exists():

@@ -22,7 +22,7 @@ from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
 from nsm.results.files import as_json
 from nsm.results.loggers import check_packages, log_figures, loggers_of
-from nsm.run_directories import is_passing
+from nsm.run_directories import is_temporary
 from nsm.tasks.ensemble import Ensemble
 
 
@@ -38,7 +38,9 @@ def run(config: DictConfig, folder: Path) -> None:
     with folder_lock(folder):
         resuming = config.resume is not None
         if resuming:
-            config = stored_config(folder, config.trust)
+            trust = list(config.trust)  # what the stored configuration trusts does not count
+            config = stored_config(folder, trust)
+            config.trust = trust
         run_task(config, folder, resuming=resuming)
 
 
@@ -160,7 +162,7 @@ def finish(
         figures["batched"] = len(ensemble.each)
     loggers = loggers_of(trainer.loggers, index)
     log_figures(loggers, task.settings, result.metrics, trainer.global_step)
-    words = {
+    summary = {
         "surface": task.surface.name,
         "steps": trainer.global_step,
         "seconds": round(time.monotonic() - started, 2),
@@ -170,9 +172,9 @@ def finish(
         **figures,
         "metrics": result.metrics,
     }
-    atomic_write(run.folder / "metrics.json", as_json(words))
+    atomic_write(run.folder / "metrics.json", as_json(summary))
     if task.table is not None:
         task.console.print(task.table(result.metrics))
-    if not is_passing(run.folder):
+    if not is_temporary(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result

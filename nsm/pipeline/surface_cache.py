@@ -25,7 +25,7 @@ from nsm.pipeline.configured_surface import configured_surface, report_surface
 from nsm.pipeline.runner import finish, run_prepared
 from nsm.pipeline.training import Run, accelerator_of, plain
 from nsm.results import NeuralSurface, load_surface
-from nsm.run_directories import passing_folder
+from nsm.run_directories import temporary_folder
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit
@@ -68,7 +68,7 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
         NsmError: a mesh, neural surface or setting that cannot be used.
     """
     if config.phi.path is not None:
-        phi = load_surface(config.phi.path)
+        phi = load_surface(config.phi.path, trust=config.trust)
         if phi.surface.domain != domain(config.domain):
             raise NsmError(
                 f"{config.phi.path}: its domain is the {phi.surface.domain}, not the "
@@ -101,7 +101,7 @@ def cached_surfaces(
     overfit = _overfit_config(config)
     settings = plain(overfit)
     if not _cacheable(settings):
-        with passing_folder() as folder:
+        with temporary_folder() as folder:
             return [
                 _made(surface, overfit, Path(folder) / str(k), console)
                 for k, surface in enumerate(surfaces)

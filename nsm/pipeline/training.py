@@ -16,7 +16,7 @@ from pytorch_lightning.loggers import Logger
 from rich.console import Console
 from torch.multiprocessing.spawn import ProcessRaisedException
 
-from nsm.config import PRECISIONS, checked, read_config
+from nsm.config import checked, read_config
 from nsm.errors import NsmError
 from nsm.instantiation import check_trusted, made
 from nsm.pipeline.checkpoints import CHECKPOINT_FILE, not_a_checkpoint, stored_state
@@ -28,7 +28,8 @@ from nsm.results.divergence_guard import DivergenceGuard
 from nsm.results.loggers import Distributed, build_loggers, close
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
-from nsm.run_directories import is_passing
+from nsm.run_directories import is_temporary
+from nsm.settings import PRECISIONS
 from nsm.surfaces.cache import cache_folder
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble
@@ -199,7 +200,7 @@ def trained(
         how = f"; go on with: nsm resume={folder}"
         if len(runs) > 1 or cache_folder() in folder.parents:  # of a sweep, or for a map
             how = "; the same command goes on"
-        console.print(f"interrupted{'' if is_passing(folder) else how}", soft_wrap=True)
+        console.print(f"interrupted{'' if is_temporary(folder) else how}", soft_wrap=True)
         raise KeyboardInterrupt
     if several:
         take_over(trainer, folder / CHECKPOINT_FILE)

@@ -1,4 +1,4 @@
-"""Results: saved artefacts, figures, pictures, exported meshes and what goes along a training."""
+"""Results: artefacts, figures, pictures and exported meshes; callbacks and loggers of trainings."""
 
 from nsm.results.analytic import analytic_surface
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface

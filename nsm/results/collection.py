@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
 from nsm.maps import PlanarMap, TransitionMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
@@ -66,9 +67,10 @@ class SurfaceCollection:
             names.append(next(n for n in candidates if n not in names))
         return names
 
-    def pair_name(self, source: int, target: int) -> str:
-        """The name of an ordered pair, "SOURCE → TARGET"."""
-        return f"{self.names[source]} → {self.names[target]}"
+    @cached_property
+    def pair_names(self) -> dict[tuple[int, int], str]:
+        """Names of the ordered pairs, "SOURCE → TARGET"."""
+        return {(i, j): f"{self.names[i]} → {self.names[j]}" for i, j in self._ordered}
 
     def pair(self, source: int, target: int) -> SurfaceMap:
         """The map F_{source→target} from any surface to any other, by number.
@@ -105,8 +107,10 @@ class SurfaceCollection:
         first = self.maps[source]
         turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
         nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
-        free = isinstance(first.inner, PlanarMap)
-        project = None if free else self.surfaces[source].surface.domain.project
+        domain = self.surfaces[source].surface.domain
+        project = None
+        if isinstance(domain, BoundedDomain) and not isinstance(first.inner, PlanarMap):
+            project = domain.project
         h = TransitionMap(_double(first), _double(self.maps[target]), nodes, project).eval()
         if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
             uv = torch.as_tensor(self.surfaces[source].surface.uv)
@@ -199,7 +203,7 @@ def collection_metrics(
         s, t = f.source.surface, f.target.surface
         landed = f.planar(targets[i]) if len(points) else points
         own = pair_metrics(s, t, f.image_uv, landed, targets[j])
-        pairs[collection.pair_name(i, j)] = {**own, **f.certificate}
+        pairs[collection.pair_names[i, j]] = {**own, **f.certificate}
     figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
     cycles = list(itertools.permutations(range(len(collection)), 3))
     cycles = cycles[:: -(-len(cycles) // _MOST_CYCLES)]

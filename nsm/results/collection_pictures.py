@@ -31,7 +31,7 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
         for i in range(k):
             for j in range(k):
                 if i != j:
-                    values[i, j] = collection.metrics["pairs"][collection.pair_name(i, j)][key]
+                    values[i, j] = collection.metrics["pairs"][collection.pair_names[i, j]][key]
         axes = figure.add_subplot(1, len(_SHOWN), n + 1)
         axes.imshow(values, cmap="viridis_r")
         middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
@@ -57,7 +57,7 @@ def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> 
         for j, target in enumerate(drawn):
             t = target.surface
             uv = source.surface.uv if i == j else collection.pair(i, j).source_uv
-            title = collection.names[i] if i == j else collection.pair_name(i, j)
+            title = collection.names[i] if i == j else collection.pair_names[i, j]
             row.append((views[j].draw(t.vertices, t.faces, checked(uv), t.seam_pairs), title))
         rows.append(row)
     save_figure(panels(*rows), path)

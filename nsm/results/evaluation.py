@@ -1,4 +1,4 @@
-"""Networks evaluated at arrays of points, in pieces that fit into memory."""
+"""Networks at arrays of points, in chunks that fit into memory."""
 
 from __future__ import annotations
 

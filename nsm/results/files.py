@@ -142,8 +142,8 @@ def read_pair(stem: Path, form: str) -> tuple[dict[str, Tensor], dict[str, Any]]
         form: name of the format.
 
     Raises:
-        NsmError: ``missing_file``, ``unreadable_file``, ``wrong_format``, ``wrong_version``,
-            ``damaged_file``.
+        NsmError: ``missing_file``, ``unreadable_file``, ``not_a_file``, ``wrong_format``,
+            ``wrong_version``, ``damaged_file``.
     """
     file, tensor_file = stem.with_suffix(".json"), stem.with_suffix(".safetensors")
     try:
@@ -212,7 +212,7 @@ def damaged(stem: Path, error: Exception) -> NsmError:
 def _read(file: Path) -> bytes:
     if file.exists() and not file.is_file():  # a pipe would be waited for, a device read for ever
         message = f"{file}: not a regular file; give the folder of a complete run"
-        raise NsmError(message, kind="unreadable_file", key=str(file))
+        raise NsmError(message, kind="not_a_file", key=str(file))
     try:
         return file.read_bytes()
     except OSError as error:

@@ -157,8 +157,8 @@ def _identity(folder: Path) -> dict[str, Any]:
     return json.loads(file.read_text()) if file.is_file() else {}
 
 
-def _identify(folder: Path, **words: Any) -> None:
-    atomic_write(folder / IDENTITY_FILE, as_json({**_identity(folder), **words}))
+def _identify(folder: Path, **identity: Any) -> None:
+    atomic_write(folder / IDENTITY_FILE, as_json({**_identity(folder), **identity}))
 
 
 class Distributed(Logger):

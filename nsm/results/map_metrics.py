@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
@@ -14,11 +16,21 @@ def triangle_metric(points: np.ndarray, faces: np.ndarray) -> torch.Tensor:
     """EᵀE (F, 2, 2) of each triangle's edge vectors E, for points (V, 2) or (V, 3).
 
     With A of the source and B of the image, A⁻¹B is similar to JᵀJ of the affine map between
-    them, as of Jacobians on Ω.
+    them, as for Jacobians on Ω.
     """
     a, b, c = (points[faces[:, k]] for k in range(3))
     edges = torch.from_numpy(np.stack([b - a, c - a], axis=2)).double()
     return edges.transpose(1, 2) @ edges
+
+
+def summaries(values: Mapping[str, np.ndarray], weights: np.ndarray) -> dict[str, float]:
+    """Median, weighted mean and 95th percentile of each of several quantities (F,), by name."""
+    figures: dict[str, float] = {}
+    for name, value in values.items():
+        figures[f"{name}_median"] = float(np.median(value))
+        figures[f"{name}_mean"] = float(np.average(value, weights=weights))
+        figures[f"{name}_p95"] = float(np.percentile(value, 95))
+    return figures
 
 
 def planar_metrics(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> dict[str, float]:
@@ -26,19 +38,13 @@ def planar_metrics(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> d
 
     Returns:
         median, mean and p95 of symmetric_dirichlet, singular_value_ratio and area over the
-        triangles, weighted by their area on the mesh for the mean; flipped_percent, against the
-        orientation of most; boundary_self_intersections, by which a map without flips can still
-        overlap itself.
+        triangles, the mean weighted by their area on the mesh; flipped_percent, of the minority's
+        orientation; boundary_self_intersections: a map without flips can still overlap itself.
     """
     source, image = triangle_metric(vertices, faces), triangle_metric(uv, faces)
-    weights = face_areas(vertices, faces)
-    figures: dict[str, float] = {}
-    for energy in (symmetric_dirichlet, singular_value_ratio, area):
-        value = energy(source, image).numpy()
-        name = energy.__name__
-        figures[f"{name}_median"] = float(np.median(value))
-        figures[f"{name}_mean"] = float(np.average(value, weights=weights))
-        figures[f"{name}_p95"] = float(np.percentile(value, 95))
+    energies = (symmetric_dirichlet, singular_value_ratio, area)
+    values = {energy.__name__: energy(source, image).numpy() for energy in energies}
+    figures = summaries(values, face_areas(vertices, faces))
     signed = signed_areas(uv, faces)
     flipped = min(int((signed <= 0).sum()), int((signed >= 0).sum()))
     figures["flipped_percent"] = 100 * flipped / len(faces)

@@ -22,11 +22,11 @@ def export_mesh(
 ) -> None:
     """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
 
-    Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². With a texture, GLB holds
-    it; OBJ gets a material file and a PNG beside it.
+    Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file contains the
+    texture; beside an OBJ file go a material file and a PNG.
 
     Raises:
-        NsmError: the file's ending is neither .obj nor .glb.
+        NsmError: ``unknown_format``: the file's ending is neither .obj nor .glb.
     """
     target = Path(path)
     coordinates = 0.5 * (np.asarray(uv) + 1)
@@ -34,12 +34,13 @@ def export_mesh(
         atomic_write(target, _glb(vertices, faces, coordinates, texture))
         return
     if target.suffix.lower() != ".obj":
-        raise NsmError(f"{target}: meshes are written as .obj or .glb")
+        message = f"{target}: meshes are written as .obj or .glb"
+        raise NsmError(message, kind="unknown_format", key=str(target))
     head = ""
     if texture is not None:
         picture = io.BytesIO()
         texture.save(picture, format="PNG")
-        # a name of its own: a picture beside the mesh may well be called as the mesh is
+        # a picture beside the mesh may have the mesh's name
         texture_file = target.with_name(f"{target.stem}_texture.png")
         atomic_write(texture_file, picture.getvalue())
         material = f"newmtl surface\nKd 1 1 1\nmap_Kd {texture_file.name}\n"

@@ -12,9 +12,9 @@ from nsm.surfaces.geometry import point_mesh_distance, subdivide
 
 # A triangle whose area φ shrinks below this share of the true one has collapsed.
 DEGENERATE_STRETCH = 1e-3
-# A mesh of so many triangles shows φ as it is; those with fewer are split.
+# meshes with fewer triangles are subdivided to show the shape of φ
 FINE_ENOUGH = 500_000
-# of φ whose distance to the mesh is measured
+# of φ's points, whose distances to the mesh are measured
 MOST_POINTS = 500_000
 
 
@@ -27,7 +27,7 @@ def vertex_error(surface: Surface, phi: nn.Module) -> np.ndarray:
 def pointwise_metrics(
     surface: Surface, phi: nn.Module, *, samples: int = 100_000, seed: int = 0
 ) -> dict[str, float]:
-    """Those figures of :func:`overfit_metrics` that are cheap: errors at matching uv.
+    """The cheap figures of :func:`overfit_metrics`: errors at matching uv.
 
     Args:
         surface, phi, samples, seed: as there.
@@ -59,8 +59,8 @@ def overfit_metrics(
     Args:
         surface: the prepared surface.
         phi: the network, with ``value_and_jacobian``.
-        samples: how many points, uniform by area on the mesh.
-        seed: of these points; they are never those of a training.
+        samples: number of points, uniform by area on the mesh.
+        seed: of these points, which no training uses.
 
     Returns:
         rms_percent and max_percent at matching uv; hausdorff_mesh_to_phi_percent and

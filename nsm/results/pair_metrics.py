@@ -1,7 +1,7 @@
 """Quality of a map between two surfaces, measured on the meshes themselves.
 
-The image of a source vertex is looked up on the target's mesh, so that no figure depends on how
-well a network stands for its surface.
+The image of a source vertex is looked up on the target's mesh, so that no figure depends on the
+error of a neural surface.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from nsm.energies import (
     singular_value_ratio,
     symmetric_dirichlet,
 )
-from nsm.results.map_metrics import triangle_metric
+from nsm.results.map_metrics import summaries, triangle_metric
 from nsm.surfaces.location import locate
 from nsm.surfaces.topology import boundary_loops, face_areas
 
@@ -31,7 +31,7 @@ ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
     area,
     arap,
 )
-# Float32 places a point of the boundary this well, and no better.
+# precision of a boundary point in float32
 ON_BOUNDARY = 1e-6
 _COVER_SAMPLES = 20_000
 
@@ -51,16 +51,10 @@ def distortion_figures(
 
     Args:
         source: vertices (V, 3) of the source mesh.
-        image: where they go, (V, 3) or (V, 2).
+        image: their images, (V, 3) or (V, 2).
         faces: (F, 3).
     """
-    weights = face_areas(source, faces)
-    figures: dict[str, float] = {}
-    for name, value in triangle_energies(source, image, faces).items():
-        figures[f"{name}_median"] = float(np.median(value))
-        figures[f"{name}_mean"] = float(np.average(value, weights=weights))
-        figures[f"{name}_p95"] = float(np.percentile(value, 95))
-    return figures
+    return summaries(triangle_energies(source, image, faces), face_areas(source, faces))
 
 
 def pair_metrics(
@@ -75,8 +69,8 @@ def pair_metrics(
     Args:
         source, target: the surfaces.
         image_uv: h at the source's vertices, (V, 2), in the target's domain.
-        landmark_image: where h sends the landmarks' preimages, (K, 2).
-        landmark_target: where it should, (K, 2).
+        landmark_image: images of the landmarks by h, (K, 2).
+        landmark_target: the landmarks in the target's domain, (K, 2).
 
     Returns:
         The figures of :func:`distortion_figures`; flipped_percent (signed area in Ω);

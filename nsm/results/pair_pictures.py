@@ -26,9 +26,9 @@ _WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
 
 
 def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
-    """The source's checkerboard, and colours by its position, beside those carried to the target.
+    """The source's checkerboard and colours of position, beside both transferred to the target.
 
-    The target is drawn with its own triangles, turned to lie best on the source.
+    The target is drawn with its own triangles, aligned with the source.
     """
     s, t = f.source.surface, f.target.surface
     target = f.aligned(t.vertices)
@@ -45,19 +45,19 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
 
     rows = [
         [
-            (at_source(checked(s.uv)), f"{s.name}: its checkerboard"),
-            (at_target(checked(f.source_uv)), f"carried to {t.name}"),
+            (at_source(checked(s.uv)), f"{s.name}: checkerboard"),
+            (at_target(checked(f.source_uv)), f"transferred to {t.name}"),
         ],
         [
             (at_source(lambda blend: blend(colours)), "colours of position"),
-            (at_target(lambda blend: blend(carried)), f"carried to {t.name}"),
+            (at_target(lambda blend: blend(carried)), f"transferred to {t.name}"),
         ],
     ]
     save_figure(panels(*rows), path)
 
 
 def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
-    """Symmetric Dirichlet on the source and on its image, and how it is distributed."""
+    """Symmetric Dirichlet on the source and on its image, with its histogram."""
     s = f.source.surface
     value = symmetric_dirichlet(
         triangle_metric(s.vertices, s.faces), triangle_metric(f.image, s.faces)
@@ -98,7 +98,7 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
 
 
 def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> None:
-    """The way from source to target: five pictures in a row, and a GIF that goes to and fro."""
+    """The morph from source to target: five pictures in a row, and a GIF, back and forth."""
     s = f.source.surface
     both = np.concatenate([s.vertices, f.aligned_image])
     frame = View(s.vertices, 8).frame
@@ -123,7 +123,7 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
 
 
 def map_image(source: Surface, target: Surface, image_uv: np.ndarray) -> np.ndarray:
-    """A quick picture (384, 384, 3) uint8: the source's checkerboard where h puts it."""
+    """A quick picture (384, 384, 3) uint8: the source's checkerboard on its image."""
     image = locate(image_uv, target.uv, target.faces).take(target.vertices, target.faces)
     view = View(target.vertices, 384)
     return np.round(255 * view.draw(image, source.faces, checked(source.uv))).astype(np.uint8)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 GREY = np.array([0.80, 0.82, 0.85])
 PANEL = 640
-# the reconstruction is drawn with at least this many triangles, so that φ itself is seen
+# at least as many triangles show the shape of φ rather than that of the mesh
 _FINE_FACES = 30_000
 
 
@@ -71,7 +71,7 @@ def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurfa
 
 
 def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -> np.ndarray:
-    """A quick picture (size, size, 3) uint8 of the surface as φ has it now."""
+    """A quick picture (size, size, 3) uint8 of φ."""
     uv, faces = _fine(surface)
     picture = View(surface.vertices, size).draw(evaluate(phi, uv), faces, _grey)
     return np.round(255 * picture).astype(np.uint8)
@@ -105,7 +105,7 @@ def parameterization_picture(
 
 
 def layout_image(surface: Surface, uv: np.ndarray, *, size: int = 384) -> np.ndarray:
-    """A map (V, 2) of the mesh as it lies in the plane, (size, size, 3) in [0, 1]."""
+    """The layout of a map (V, 2) in the plane, (size, size, 3) in [0, 1]."""
     flat = np.column_stack([uv, np.zeros(len(uv))])
     return View(flat, size, frame=np.eye(3)).draw(flat, surface.faces, checked(uv))
 
@@ -137,7 +137,7 @@ def panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG (see :func:`atomic_write`)."""
     data = io.BytesIO()
     FigureCanvasAgg(figure).print_png(data)
     atomic_write(path, data.getvalue())

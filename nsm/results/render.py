@@ -1,7 +1,7 @@
-"""A small exact rasteriser: meshes to pictures without a window, a driver or a long wait.
+"""A small exact rasteriser: pictures of meshes without a window or a driver.
 
-Drawing libraries either need OpenGL, which servers often lack, or draw triangle by triangle in
-seconds and sort them wrongly; training wants a picture now and then in a fraction of a second.
+Drawing libraries need OpenGL, which servers often lack, or take seconds to draw triangle by
+triangle and sort them wrongly; a picture during training may take a fraction of a second.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _LIGHT = np.array([-0.35, 0.55, 0.75]) / np.linalg.norm([-0.35, 0.55, 0.75])
 def view_frame(vertices: np.ndarray) -> np.ndarray:
     """Rows right, up and towards the viewer (3, 3) of a good view of a mesh.
 
-    Up is y, as in most mesh files, and the longer horizontal side is seen; a height field over x
-    and y is looked down on at a slant.
+    Up is y, as in most mesh files, and the view shows the longer horizontal side; of a height field
+    over x and y it is from above, at a slant.
     """
     extent = np.ptp(vertices, axis=0)
     if extent[2] < 0.25 * extent[:2].min():
@@ -55,7 +55,7 @@ def rasterise(
         coordinates (P, 3).
     """
     corners, z = xy[faces], depth[faces]
-    # what is not finite or far larger than the picture is left out
+    # skip triangles that are not finite or far larger than the picture
     visible = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < 4 * size).all(axis=(1, 2))
     kept = np.where(visible[:, None, None], corners, 0.0)
     low = np.floor(kept.min(axis=1)).astype(np.int64)
@@ -110,7 +110,7 @@ class View:
     Args:
         reference: vertices (V, 3) that fill the picture.
         size: side of the picture in pixels.
-        frame: rows right, up, towards the viewer (3, 3); without it, a good view.
+        frame: rows right, up, towards the viewer (3, 3); by default :func:`view_frame`.
     """
 
     def __init__(self, reference: np.ndarray, size: int, frame: np.ndarray | None = None) -> None:
@@ -133,7 +133,7 @@ class View:
             vertices, faces: the mesh (V, 3), (F, 3).
             colours: gives the colours (P, 3) in [0, 1] of the pixels, from a function that
                 interpolates vertex values (V, k) to them, (P, k).
-            seam_pairs: (T, 2) vertices that were one before the cut: no crease shows there.
+            seam_pairs: (T, 2) vertices that were one before the cut, which share a normal.
         """
         fine = self.size * _SUPERSAMPLING
         turned = vertices @ self.frame.T

@@ -38,7 +38,7 @@ _MAP_COLUMNS = {
 
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
     """The figures of :func:`nsm.results.planar_metrics`, a row for each map."""
-    table = Table("map", padding=(0, 1, 0, 0))  # headings are whole in a terminal of 80 columns
+    table = Table("map", padding=(0, 1, 0, 0))  # headings fit a terminal of 80 columns
     table.columns[0].no_wrap = True
     for heading in _MAP_COLUMNS.values():
         table.add_column(heading, width=max(map(len, heading.split())))
@@ -84,9 +84,7 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
     for name, figures in metrics["pairs"].items():
         table.add_row(name, *(f"{figures[key]:.3f}" for key in _COLLECTION_COLUMNS))
     cycle = [metrics[f"cycle_error_{key}_percent"] for key in ("mean", "max")]
-    table.caption = (
-        f"cycle error {cycle[0]:.2g} % of the diagonal in the mean, {cycle[1]:.2g} % at most"
-    )
+    table.caption = f"cycle error: mean {cycle[0]:.2g} %, maximum {cycle[1]:.2g} % of the diagonal"
     return table
 
 

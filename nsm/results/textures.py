@@ -1,4 +1,4 @@
-"""Textures that show distortion."""
+"""Checkerboard textures, which show distortion."""
 
 from __future__ import annotations
 

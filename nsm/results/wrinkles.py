@@ -1,8 +1,8 @@
 """Wrinkles of a neural surface: how much more its normal turns than the source's.
 
-A network can be near its mesh everywhere and still be creased. A distance does not see that, and a
-normal error mixes it with slow deviations, which are no wrinkles. What is compared here is how the
-normal changes over a short way, on φ and on the source.
+A network can be near its mesh everywhere and still have creases. Distances do not show them, and
+normal errors mix them with slow deviations, which are no wrinkles. This module compares how the
+normal changes over a short distance on φ and on the source.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from nsm.results.evaluation import evaluate_jacobian
 from nsm.results.render import vertex_normals
 from nsm.surfaces.location import Places, locate
 
-# length of the short way, of the diagonal of the mesh's bounding box
+# in units of the diagonal of the mesh's bounding box
 DISTANCE = 0.01
 
 
@@ -27,25 +27,25 @@ def normal_variation(
     samples: int = 20_000,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Compare how the normal changes over a short way on φ and on the source mesh.
+    """Compare how the normal changes over a short distance on φ and on the source mesh.
 
     Points p are uniform by area on the mesh; q is the mesh's point nearest to p moved by
     ``distance`` in a random tangential direction. With n the unit normal of φ at the same uv, m
-    that of the mesh (its vertex normals, interpolated, so that its flat triangles are no wrinkles),
-    and Δn = n(q) - n(p), Δm likewise: lengths of differences of unit normals, read as angles in
-    radians, which they are while small; where φ has no normal, 180 degrees.
+    that of the mesh (interpolated vertex normals, so that flat triangles are no wrinkles), and
+    Δn = n(q) - n(p), Δm likewise. Lengths of differences of unit normals approximate angles in
+    radians; where φ has no normal, they count as 180 degrees.
 
     Args:
         surface: the prepared surface.
         phi: the network, with ``value_and_jacobian``.
-        distance: length of the way, of the diagonal of the mesh's bounding box.
-        samples: how many ways.
-        seed: of these; they are never the points of a training.
+        distance: from p to q, in units of the diagonal of the mesh's bounding box.
+        samples: number of pairs.
+        seed: of the pairs, which no training uses.
 
     Returns:
-        normal_variation_error_degrees, the root mean square of Δn - Δm: 0 for a φ that bends as
-        the source does; normal_variation_excess_degrees, RMS of Δn less RMS of Δm: above 0 a
-        surface more wrinkled than its source, below 0 one that smooths the source's detail over.
+        normal_variation_error_degrees, the root mean square of Δn - Δm, 0 if φ bends as the source
+        does; normal_variation_excess_degrees, RMS of Δn less RMS of Δm: above 0 φ is more wrinkled
+        than its source, below 0 it smooths the source's detail.
     """
     start, end = _ways(surface, distance * surface.bounding_box_diagonal, samples, seed)
     smooth = vertex_normals(surface.vertices, surface.faces, surface.seam_pairs)
@@ -55,7 +55,7 @@ def normal_variation(
         jacobian = evaluate_jacobian(phi, places.take(surface.uv, surface.faces))[1]
         there.append(_unit(np.cross(jacobian[:, :, 0], jacobian[:, :, 1])))
         mesh.append(_unit(places.take(smooth, surface.faces)))
-    # where the mesh itself has no normal, nothing can be compared
+    # leave out points where the mesh has no normal
     known = np.isfinite(mesh[0] + mesh[1]).all(axis=1)
     turned, source = ((a[1] - a[0])[known] for a in (there, mesh))
     return {

@@ -1,4 +1,4 @@
-"""Evaluations made faster by torch.compile, where it is to be had."""
+"""Evaluations made faster by torch.compile, where there is a compiler."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Compiled:
     compiled, or a machine without a compiler, is no error: the function is called as it is.
 
     Args:
-        say: told, in one line, why a function was left as it is.
+        say: called with one line on why a function was left as it is.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -27,7 +27,7 @@ class Compiled:
         self._made: dict[str, Evaluation] = {}
 
     def __call__(self, function: Evaluation, x: Tensor) -> tuple[Tensor, ...]:
-        """``function(x)``; functions of one name are taken for one."""
+        """``function(x)``; functions of the same name count as the same."""
         name = function.__qualname__
         if name in self._made:
             return self._made[name](x)
@@ -36,9 +36,9 @@ class Compiled:
         made: Any = torch.compile(function, dynamic=False, mode=mode)
         try:
             result: tuple[Tensor, ...] = made(x)
-        except Exception as error:  # of the compiler's many parts; a fault of ours comes again
+        except Exception as error:  # of any kind; an error in the function itself is raised again
             result, made = function(x), function
             reason = " ".join(str(error).split())[:120]
-            self.say(f"not compiled, the training goes on without: {reason}")
+            self.say(f"not compiled, training continues without: {reason}")
         self._made[name] = made
         return result

@@ -1,8 +1,8 @@
 """A start for φ: the surface as a linear function of the encoding's features, by least squares.
 
-A spline grid is linear in its tables, so that the best surface it holds is the solution of a sparse
-linear system: some seconds, where gradient steps take minutes to come as near. What is minimised
-over samples p, most of them uniform by area, with δ = f − φ, is
+A spline grid is linear in its tables, so that its best fit of a surface solves a sparse linear
+system. That takes seconds; gradient steps take minutes to come as near. With δ = f − φ, the fit
+minimises, over samples p, most of them uniform by area,
 
     mean ‖δ(p)‖² + μ mean ‖dδ(p)‖²,
 
@@ -46,18 +46,18 @@ _STREAM = -2  # of the random numbers: no step has it
 
 
 def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> None:
-    """Set a network's read-out, and the tables of its grid, to the best fit of a surface.
+    """Set a network's linear skip, and the tables of its grid, to the best fit of a surface.
 
-    The network itself starts at zero behind it. The levels of a grid are fitted in turn, each to
-    what the coarser ones leave.
+    The network itself starts at zero. The levels of a grid are fitted in turn, each to the
+    residual of the coarser ones.
 
     Args:
-        network: φ with a read-out, on the CPU.
+        network: φ with a linear skip, on the CPU.
         surface: the prepared surface.
         seed: of the samples.
 
     Raises:
-        ValueError: a grid of fewer features than the read-out has coordinates.
+        ValueError: a grid of fewer features than the linear skip has outputs.
     """
     assert network.linear_skip is not None
     encoding = network.encoding
@@ -173,7 +173,7 @@ def _normal_equations(
 def _fit_weights(
     encoding: Encoding, linear_skip: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
 ) -> None:
-    """Features without tables stay as they are: the read-out's weights alone are fitted."""
+    """Features without tables stay as they are: the linear skip's weights alone are fitted."""
     features = torch.cat([value_and_jacobian_stack(encoding, uv), torch.zeros(3, len(uv), 1)], 2)
     features[0, :, -1] = 1.0  # the bias
     design = _rows(features.double(), along).flatten(0, 1)

@@ -19,19 +19,19 @@ _SIGNS = ("out of memory", "not enough memory", "can't allocate memory", "alloc_
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out, on whatever device."""
+    """Whether an error says that memory ran out, on any device."""
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         return True
-    told = str(error).lower()
-    return isinstance(error, RuntimeError) and any(sign in told for sign in _SIGNS)
+    text = str(error).lower()
+    return isinstance(error, RuntimeError) and any(sign in text for sign in _SIGNS)
 
 
 class Microbatching(pl.LightningModule):
     """Base of the tasks: a step that runs out of memory is tried again with its batch in halves.
 
     Networks are evaluated part by part, and once more for each part's gradient, so that only one
-    part's intermediate values are held at a time. Gradients accumulate over the parts; the loss is
-    that of the whole batch, also where it is no sum over points.
+    part's intermediate values are in memory at a time. Gradients accumulate over the parts; the
+    loss is that of the whole batch, also where it is no sum over points.
 
     Attributes:
         microbatches: the number of parts that a batch is evaluated in; kept in the checkpoint, so

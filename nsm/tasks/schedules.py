@@ -15,6 +15,7 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 from nsm.errors import NsmError
 from nsm.instantiation import made_with
+from nsm.settings import Count, Share, Weight, Whole
 
 Course = Callable[[float], float]  # of the step: share of the full rate
 
@@ -31,7 +32,7 @@ class Constant(LambdaLR):
         NsmError: a negative number.
     """
 
-    def __init__(self, optimizer: Optimizer, warmup: int = 0, peak: float = 1.0) -> None:
+    def __init__(self, optimizer: Optimizer, warmup: Whole = 0, peak: Weight = 1.0) -> None:
         super().__init__(optimizer, _share(lambda step: 1.0, warmup, peak))
 
 
@@ -53,9 +54,9 @@ class Cosine(LambdaLR):
         self,
         optimizer: Optimizer,
         max_steps: int,
-        warmup: int = 0,
-        final: float = 0.0,
-        peak: float = 1.0,
+        warmup: Whole = 0,
+        final: Share = 0.0,
+        peak: Weight = 1.0,
     ) -> None:
         _check(final=final)
 
@@ -84,11 +85,11 @@ class SGDR(LambdaLR):
     def __init__(
         self,
         optimizer: Optimizer,
-        period: float = 1000,
+        period: Count = 1000,
         period_factor: float = 2.0,
-        final: float = 0.0,
-        warmup: int = 0,
-        peak: float = 1.0,
+        final: Share = 0.0,
+        warmup: Whole = 0,
+        peak: Weight = 1.0,
     ) -> None:
         _check(final=final)
         if not period > 0:

@@ -4,11 +4,15 @@ import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import nsm
+from nsm.config import compose_config
 from nsm.domains import Disc
-from nsm.pipeline import certification
+from nsm.errors import NsmError
+from nsm.pipeline import Task, certification
 from nsm.results.analytic import analytic_surface
+from nsm.results.divergence_guard import DivergenceGuard
 from nsm.surfaces.shapes import ring_mesh
 
 QUICK = ["experiment=quick", "data.held_out=512", "trainer.threads=1"]
@@ -60,3 +64,71 @@ def test_where_moving_vertices_is_not_enough_training_goes_on(ends, tmp_path, mo
     assert short["rounds"] == 0 and not short["certified"]
     assert 1 <= long["rounds"] <= 2
     assert long["flipped_triangles"] < long["before_repair"]["flipped_triangles"]
+
+
+class Found:
+    """A result with so many faults, which its repair lowers."""
+
+    def __init__(self, flips, overlaps=0, mended=0):
+        self.flips, self.overlaps, self.mended = flips, overlaps, mended
+
+    @property
+    def certificate(self):
+        return {
+            "certified": self.flips == self.overlaps == 0,
+            "flipped_triangles": self.flips,
+            "boundary_self_intersections": self.overlaps,
+        }
+
+    def repaired(self):
+        return Found(self.flips - self.mended, self.overlaps)
+
+
+class Scripted(Task):
+    """A task whose rounds end in these results, one after the other."""
+
+    def __init__(self, *results, rounds=2):
+        super().__init__()
+        words = [*QUICK, f"certification.rounds={rounds}"]
+        self.setup(compose_config(["task=param", *words]), Console(quiet=True))
+        self.results = list(results)
+
+    def make_result(self, module):
+        return self.results.pop(0)
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    made = []
+    monkeypatch.setattr(certification, "_train_on", lambda *_: made.append(1))
+    return made
+
+
+def test_the_best_round_is_returned_not_the_last(trainings):
+    task = Scripted(Found(9), Found(4, mended=1), Found(7))
+    best, figures = certification.certified(task, None, None)
+    assert best.flips == figures["flipped_triangles"] == 3
+    assert figures["rounds"] == len(trainings) == 2
+    assert figures["before_repair"]["flipped_triangles"] == 9
+
+
+def test_a_boundary_that_overlaps_itself_spends_no_rounds(trainings):
+    best, figures = certification.certified(Scripted(Found(2, overlaps=3, mended=2)), None, None)
+    assert (best.flips, best.overlaps) == (0, 3) and not figures["certified"]
+    assert figures["rounds"] == len(trainings) == 0
+
+
+def test_further_trainings_are_guarded_and_a_failure_keeps_what_there_is(monkeypatch):
+    seen = []
+
+    def no_trainer(config, callbacks, **_):
+        seen.extend(callbacks)
+        raise NsmError("the loss is not finite", kind="not_finite")
+
+    class Module:
+        def strengthen(self, steps):
+            assert steps >= 1
+
+    monkeypatch.setattr(certification, "lightning_trainer", no_trainer)
+    best, _ = certification.certified(Scripted(Found(5, mended=1)), Module(), None)
+    assert best.flips == 4 and [type(c) for c in seen] == [DivergenceGuard]

@@ -21,7 +21,8 @@ import nsm
 
 folder = Path(sys.argv[1])
 short = ["trainer.max_steps=12", "data.steps_per_epoch=6", "data.held_out=256", "map.width=16",
-         "optimizer=sgd", "optimizer.lr=0.02", "artefacts=false", "logger=csv", "trainer.log_every=3"]
+         "optimizer=sgd", "optimizer.lr=0.02", "artefacts=false", "logger=csv",
+         "trainer.log_every=3"]
 surface = nsm.Surface.load("saddle", parameterization="tutte", cache=False)
 phis = [
     nsm.overfit(surface, folder=folder / f"overfit_{n}", progress=False,
