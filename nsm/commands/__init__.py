@@ -1,4 +1,4 @@
-"""Commands other than tasks: ``nsm COMMAND ...``, each a module with ``main(words)``."""
+"""Commands other than tasks: ``nsm COMMAND ...``, each a module with ``main(arguments)``."""
 
 from __future__ import annotations
 

@@ -8,11 +8,11 @@ from nsm.arguments import Arguments
 from nsm.commands import add_trust
 
 
-def main(words: list[str]) -> None:
-    """Write the page for the words of the command line.
+def main(arguments: list[str]) -> None:
+    """Write the page for the arguments of the command line.
 
     Raises:
-        NsmError: wrong words, or as :func:`nsm.results.report.write_report`.
+        NsmError: wrong arguments, or as :func:`nsm.results.report.write_report`.
     """
     parser = Arguments(
         prog="nsm report",
@@ -34,12 +34,10 @@ def main(words: list[str]) -> None:
     )
     parser.add_argument("--title", default="nsm report", help="default: %(default)s")
     add_trust(parser)
-    arguments = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     # torch takes seconds to import, which --help and wrong options do not need
     from nsm.results.report import write_report
 
-    runs, incomplete = write_report(
-        arguments.folders, arguments.output, arguments.title, arguments.trust
-    )
+    runs, incomplete = write_report(given.folders, given.output, given.title, given.trust)
     others = f", {incomplete} incomplete or damaged" if incomplete else ""
-    print(f"{runs} run{'s' if runs != 1 else ''}{others}: {arguments.output}")
+    print(f"{runs} run{'s' if runs != 1 else ''}{others}: {given.output}")

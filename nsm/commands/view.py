@@ -10,11 +10,11 @@ from nsm.commands import add_trust
 from nsm.optional_dependencies import needed
 
 
-def main(words: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Serve the viewer until Ctrl-C.
 
     Raises:
-        NsmError: wrong words, or as :func:`nsm.load` and :func:`nsm.results.view.serving`.
+        NsmError: wrong arguments, or as :func:`nsm.load` and :func:`nsm.results.view.serving`.
         KeyboardInterrupt: Ctrl-C.
     """
     parser = Arguments(
@@ -35,14 +35,14 @@ def main(words: list[str]) -> None:
         help="address to listen on; default: %(default)s, this machine only; 0.0.0.0 for all",
     )
     add_trust(parser)
-    arguments = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     needed("viser", "nsm view", "view")
     # torch takes seconds to import, which --help and wrong options do not need
     from nsm.api import load
     from nsm.results.view import serving
 
-    result = load(arguments.folder, trust=arguments.trust)
-    with serving(result, arguments.host, arguments.port) as (_, address):
-        print(f"{arguments.folder}: {address} (Ctrl-C ends)", flush=True)
+    result = load(given.folder, trust=given.trust)
+    with serving(result, given.host, given.port) as (_, address):
+        print(f"{given.folder}: {address} (Ctrl-C ends)", flush=True)
         while True:
             time.sleep(3600)

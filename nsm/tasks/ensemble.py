@@ -17,7 +17,7 @@ class EnsembleSplit(Exception):
     """Trainings in one batch cannot go on together.
 
     Args:
-        reason: in a few words.
+        reason: in short.
         which: those that have to be trained alone; the others may go on together.
     """
 
