@@ -29,8 +29,8 @@ TINY = [
     "data.held_out=256",
     "trainer.max_steps=20",
     "trainer.progress=false",
-    "logger.every=5",
-    "logger.pictures=0",
+    "trainer.log_every=5",
+    "trainer.log_pictures=0",
     "artefacts=false",
 ]
 HOSTILE = "<img src=x onerror=window.pwned=1> %{x} <b>bold<"
