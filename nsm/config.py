@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nsm.errors import NsmError
 from nsm.migration import check_override, migrated
-from nsm.settings import defaults
+from nsm.settings import conf_folder, defaults
 from nsm.sweeps import sweep_folder
 
 # groups of which an option is one ``_target_``, and those that hold several of them by name
@@ -36,13 +36,6 @@ _LARGEST_CONFIG = 1_000_000  # bytes
 _LONGEST_NAME = 100  # of a run folder, without its time; file systems take 255 bytes
 # settings that are files or folders: signs that Hydra's grammar reserves are quoted for the user
 _PATHS = ("surface.path", "phi.path", "source", "target", "landmarks", "resume", "hydra.run.dir")
-
-
-def conf_folder() -> Path:
-    """The configuration: inside an installed package, or beside it in a clone."""
-    package = Path(__file__).parent
-    installed = package / "conf"
-    return installed if installed.is_dir() else package.parent / "conf"
 
 
 def register() -> None:

@@ -6,9 +6,13 @@ run is rewritten, so that its folder can still be loaded and resumed.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
+import yaml
+
 from nsm.errors import NsmError
+from nsm.settings import conf_folder
 
 # old key to new key; what follows an old key after a dot follows the new one
 RENAMED = {
@@ -38,54 +42,7 @@ OPTIONS: dict[tuple[str, str], tuple[str, str]] = {
     ("sweep", "lambda_seam"): ("sweep", "seam_weight"),
     ("energy", "overfit"): ("loss_weights", "overfit"),
 }
-# of groups whose options were names with parameters: name to ``_target_``
-_ACTIVATIONS = "nsm.maps.activations."
-_ENCODINGS = "nsm.maps.encodings."
-_SCHEDULES = "nsm.tasks.schedules."
-_LOGGERS = "nsm.results.loggers."
-TARGETS: dict[str, dict[str, str]] = {
-    "activation": {
-        "softplus": _ACTIVATIONS + "Softplus",
-        "relu": _ACTIVATIONS + "ReLU",
-        "leaky_relu": _ACTIVATIONS + "LeakyReLU",
-        "silu": _ACTIVATIONS + "SiLU",
-        "gelu": _ACTIVATIONS + "GELU",
-        "tanh": _ACTIVATIONS + "Tanh",
-        "elu": _ACTIVATIONS + "ELU",
-        "sine": _ACTIVATIONS + "Sine",
-    },
-    "encoding": {
-        "spline_grid": _ENCODINGS + "SplineGrid",
-        "fourier": _ENCODINGS + "RandomFourierFeatures",
-        "identity": _ENCODINGS + "Identity",
-    },
-    "optimizer": {
-        "adam": "torch.optim.Adam",
-        "adamw": "torch.optim.AdamW",
-        "rmsprop": "torch.optim.RMSprop",
-        "sgd": "torch.optim.SGD",
-        "lbfgs": "torch.optim.LBFGS",
-        "muon": "nsm.tasks.optimizers.MuonBesideAdam",
-    },
-    "scheduler": {
-        "constant": _SCHEDULES + "Constant",
-        "cosine": _SCHEDULES + "Cosine",
-        "sgdr": _SCHEDULES + "SGDR",
-    },
-    "domain": {"disc": "nsm.domains.Disc", "square": "nsm.domains.Square"},
-    "task": {
-        "overfit": "nsm.pipeline.overfit.OverfitTask",
-        "param": "nsm.pipeline.param.ParamTask",
-        "pair_map": "nsm.pipeline.pair_map.PairMapTask",
-        "collection_map": "nsm.pipeline.collection_map.CollectionMapTask",
-    },
-    "logger": {
-        "tensorboard": _LOGGERS + "TensorBoard",
-        "csv": _LOGGERS + "CSV",
-        "wandb": _LOGGERS + "WandB",
-        "mlflow": _LOGGERS + "MLflow",
-    },
-}
+# groups whose options were names with parameters
 _NAMED = ("activation", "encoding", "optimizer", "scheduler", "task")
 
 
@@ -97,7 +54,7 @@ def check_override(key: str, value: str) -> None:
         "logger.kinds": "logger=tensorboard, csv, both, wandb, mlflow or none",
         "trainer": "trainer.SETTING=VALUE, as it is no group any more",
     }.get(bare)
-    if last == "name" and value in TARGETS.get(group, ()):
+    if last == "name" and group in _NAMED and (conf_folder() / group / f"{value}.yaml").is_file():
         new = f"{group}={value}"
     for option in value.split(","):
         new = "=".join(OPTIONS[bare, option]) if (bare, option) in OPTIONS else new
@@ -133,7 +90,7 @@ def migrated(settings: Any) -> dict[str, Any]:
             network[RENAMED[f"map.{key}"].rpartition(".")[2]] = network.pop(key)
     weights = {k: v for k, v in {**energy, **constraints}.items() if k.startswith("lambda_")}
     held = {key: value for key, value in constraints.items() if key not in weights}
-    kinds = {k: {"_target_": _target("logger", k)} for k in logger.get("kinds", ())}
+    kinds = {k: {"_target_": old_target("logger", k)} for k in logger.get("kinds", ())}
     for kind, key in (("wandb", "project"), ("mlflow", "project"), ("mlflow", "uri")):
         if kind in kinds and key in logger:
             kinds[kind][key] = logger[key]
@@ -143,14 +100,14 @@ def migrated(settings: Any) -> dict[str, Any]:
     named = {}
     for group in _NAMED:
         rest = _mapping(old, group)
-        named[group] = {"_target_": _target(group, rest.pop("name", None)), **rest}
+        named[group] = {"_target_": old_target(group, rest.pop("name", None)), **rest}
     named["task"]["name"] = name
     return {
         **{key: value for key, value in old.items() if key != "guarantee"},
         **named,
         "certification": old.get("guarantee", old.get("certification", {})),
         "map": {"_target_": "nsm.maps.NeuralMap", **network},
-        "domain": {"_target_": _target("domain", old["domain"])},
+        "domain": {"_target_": old_target("domain", old["domain"])},
         "energy": blend if "weights" in energy else None,
         "loss_weights": {key.removeprefix("lambda_"): value for key, value in weights.items()},
         "constraints": held or None,
@@ -169,10 +126,16 @@ def _mapping(settings: Any, key: str) -> dict[str, Any]:
     return dict(value or {})
 
 
-def _target(group: str, name: Any) -> str:
-    """The ``_target_`` of an option's old name; one that a user registered keeps it."""
-    if str(name) in TARGETS[group]:
-        return TARGETS[group][str(name)]
+def old_target(group: str, name: Any) -> str:
+    """The ``_target_`` of the option that an older file names; one that a user registered keeps it.
+
+    Raises:
+        ValueError: no option, and none that could be registered.
+    """
+    file = conf_folder() / group / f"{name}.yaml"
+    if re.fullmatch(r"[a-z_]+", str(name)) and file.is_file():
+        node = yaml.safe_load(file.read_text(encoding="utf-8"))
+        return str(node.get(group, node.get(name, node))["_target_"])
     if group in ("activation", "encoding"):
         return f"nsm.extensions.registered.{name}"
     raise ValueError(f"{group} {str(name)[:60]!r} is not known")

@@ -12,6 +12,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
 
@@ -415,6 +416,13 @@ class Settings:
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0  # the largest that numpy takes
     artefacts: bool = True
     resume: str | None = None
+
+
+def conf_folder() -> Path:
+    """The configuration: inside an installed package, or beside it in a clone."""
+    package = Path(__file__).parent
+    installed = package / "conf"
+    return installed if installed.is_dir() else package.parent / "conf"
 
 
 def defaults() -> dict[str, Any]:

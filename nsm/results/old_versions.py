@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsm.instantiation import REGISTERED
-from nsm.migration import TARGETS, migrated
+from nsm.migration import migrated, old_target
 from nsm.surfaces.cutting import first_copies
 
 _PLANAR = {None: "PlanarMap", "disc": "DiscMap", "square": "SquareMap"}
@@ -57,6 +56,6 @@ def _map(old: dict[str, Any]) -> dict[str, Any]:
     network = {_SETTINGS.get(key, key): value for key, value in old.items()}
     for part, default in (("activation", "softplus"), ("encoding", "identity")):
         named = dict(old.get(part) or {"name": default})
-        name = str(named.pop("name"))
-        network[part] = {"_target_": TARGETS[part].get(name, f"{REGISTERED}.{name}"), **named}
+        name = named.pop("name")
+        network[part] = {"_target_": old_target(part, name), **named}
     return {"_target_": "nsm.maps.NeuralMap", **network}
