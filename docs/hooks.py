@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
 from nsm.config import composed  # noqa: E402
-from nsm.config_docs import (  # noqa: E402
+from nsm.help import (  # noqa: E402
     Group,
     Setting,
     groups,

@@ -11,9 +11,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nsm.config import compose_config, conf_folder, unknown_setting
-from nsm.config_docs import known_keys
 from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
+from nsm.help import known_keys
 from nsm.instantiation import target_of
 from nsm.pipeline import Given, run_task
 from nsm.pipeline.folder_lock import folder_lock

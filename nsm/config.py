@@ -287,7 +287,7 @@ def unknown_setting(key: str, known: Sequence[str] | None = None, what: str = ""
         what: which thing has no such setting, if it belongs to one.
     """
     if known is None:
-        from nsm.config_docs import known_keys
+        from nsm.help import known_keys
 
         hint = nearest(key, known_keys(), "see nsm --help")
     else:

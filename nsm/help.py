@@ -1,18 +1,195 @@
-"""``nsm --help``: the groups with their options; ``nsm --help NAME``: one, or a setting."""
+"""The groups, options and settings with a remark on each: for ``nsm --help`` and the docs.
+
+Groups and options come from the comments in conf/; settings from the signatures and docstrings of
+what an option's ``_target_`` names, and from :mod:`nsm.settings`.
+"""
 
 from __future__ import annotations
 
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import docstring_parser
+import yaml
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from nsm.config import composed, nearest
-from nsm.config_docs import Group, Setting, groups, known_keys, option_settings, plain_settings
+from nsm import settings as plain
+from nsm.config import COLLECTIONS, composed, conf_folder, nearest
 from nsm.errors import NsmError
+
+_PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
+_DEFAULT = re.compile(r"  - (?:override )?([^\s:]+): (\S+)$")
+# whose docstrings say what the settings of these groups are
+_DATACLASSES: dict[str, tuple[type, ...]] = {
+    "loss_weights": (plain.OverfitWeights, plain.ParamWeights, plain.PairWeights),
+    "constraints": (plain.ParamConstraints, plain.PairConstraints),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting: its dotted key, its value as YAML, and what it is."""
+
+    key: str
+    value: str
+    remark: str
+
+
+@dataclass(frozen=True)
+class Group:
+    """A choice: its options with a remark on each, and the default (``null``: none)."""
+
+    name: str
+    remark: str
+    default: str
+    options: dict[str, str]
+
+
+def groups() -> list[Group]:
+    """All groups in the order of the defaults list, but for the task, which comes first."""
+    found, remark = [], []
+    for line in (conf_folder() / "config.yaml").read_text(encoding="utf-8").splitlines():
+        entry = _DEFAULT.match(line)
+        if line.startswith("  #"):
+            remark.append(line.strip(" #"))
+        elif entry:
+            if remark:  # the others are Hydra's, and no choice of ours
+                name, default = entry.groups()
+                files = sorted((conf_folder() / name).glob("*.yaml"))
+                options = {file.stem: _first_comment(file) for file in files}
+                found.append(Group(name, " ".join(remark), default, options))
+            remark = []
+    return sorted(found, key=lambda group: group.name != "task")
+
+
+def _first_comment(file: Path) -> str:
+    lines = file.read_text(encoding="utf-8").splitlines()
+    comments = [line for line in lines if line.startswith("#") and not _PACKAGE.match(line)]
+    return comments[0].strip("# ") if comments else ""
+
+
+def option_settings(group: str, name: str, run: Mapping[str, Any] | None = None) -> list[Setting]:
+    """The settings of an option, with their values.
+
+    Args:
+        group, name: of the option.
+        run: the configuration of a run that has chosen it, whose values are shown then.
+    """
+    text = (conf_folder() / group / f"{name}.yaml").read_text(encoding="utf-8")
+    package = _PACKAGE.match(text)
+    node: Any = OmegaConf.to_container(OmegaConf.create(text))
+    node.pop("defaults", None)
+    if package:  # settings of other groups: those of the file alone
+        return [_setting(k, v) for k, v in _leaves(node) if k not in ("hydra.mode", "task.name")]
+    key = group.replace("/", ".")
+    if run is not None and not group.startswith("hydra/"):
+        node = run.get(key) or node
+    if group in COLLECTIONS:
+        return [s for k, part in node.items() for s in target_settings(f"{key}.{k}", group, part)]
+    if "_target_" in node:
+        return target_settings(key, group, node)
+    for kind in _DATACLASSES.get(group, ()):
+        known = plain.parameters(kind)[0]
+        if {k for k, p in known.items() if p.required} <= set(node) <= set(known):
+            node = {k: node.get(k, p.default) for k, p in known.items()}
+    return [_setting(f"{key}.{k}", value) for k, value in node.items()]
+
+
+def target_settings(key: str, group: str, node: Mapping[str, Any]) -> list[Setting]:
+    """The settings of a node with ``_target_``: all parameters that its signature has."""
+    # torch takes seconds; the overview of the help need not wait
+    from nsm.config_validation import takes
+    from nsm.instantiation import named_object
+
+    thing = named_object(str(node["_target_"]))
+    said = remarks(thing)
+    return [
+        Setting(f"{key}.{k}", _yaml(node.get(k, p.default)), p.remark or said.get(k, ""))
+        for k, p in takes(group, thing)[0].items()
+        if k != "name" or group != "task"
+    ]
+
+
+def plain_settings(run: Mapping[str, Any]) -> list[Setting]:
+    """The settings outside the groups, with their values in a configuration."""
+    run = OmegaConf.to_container(run) if isinstance(run, DictConfig) else run  # type: ignore[assignment]
+    nested = {key: run[key] for key in plain.parts()}
+    others = {key: run[key] for key in plain.parameters(plain.Settings)[0] if key not in nested}
+    return [_setting(key, value) for key, value in _leaves({**nested, **others})]
+
+
+def known_keys() -> list[str]:
+    """Names of all groups and plain settings, dotted."""
+    keys = {group.name.replace("/", ".") for group in groups()}
+    return sorted(keys | set(plain.parts()) | set(_plain_remarks()))
+
+
+def _setting(key: str, value: Any) -> Setting:
+    if key.startswith("hydra.sweeper.params."):
+        return Setting(key, _yaml(value), "the values of the sweep")
+    return Setting(key, _yaml(value), _plain_remarks().get(key) or _default_remarks(key))
+
+
+def _default_remarks(key: str) -> str:
+    """What the class of a group's default option says of one of its settings."""
+    from nsm.instantiation import named_object
+
+    group, _, name = key.partition(".")
+    node = composed()[0].get(group) or {}
+    return remarks(named_object(node["_target_"])).get(name, "") if "_target_" in node else ""
+
+
+@cache
+def _plain_remarks() -> dict[str, str]:
+    found = dict(remarks(plain.Settings))
+    nested = {key: (kind,) for key, kind in plain.parts().items()}
+    for key, kinds in {**nested, **_DATACLASSES}.items():
+        for kind in kinds:
+            found |= {f"{key}.{name}": text for name, text in remarks(kind).items()}
+    return found
+
+
+def remarks(thing: Callable[..., Any]) -> dict[str, str]:
+    """What the docstring of a class or function says of its parameters, in a line each."""
+    found: dict[str, str] = {}
+    for text in (getattr(thing, "__doc__", None), getattr(thing.__init__, "__doc__", None)):  # type: ignore[misc]
+        for parameter in docstring_parser.parse(text or "").params:
+            line = " ".join((parameter.description or "").split())
+            line = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", line).replace("``", "`")
+            line = re.sub(r" \(default: .*\)$", "", line)  # the value stands beside it
+            for name in parameter.arg_name.split(","):
+                found.setdefault(name.strip("* "), line.rstrip("."))
+    return found
+
+
+def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in node.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{key}.")
+        elif key != "_target_":
+            yield f"{prefix}{key}", value
+
+
+def _yaml(value: Any) -> str:
+    if value is inspect.Parameter.empty:
+        return "???"  # as Hydra writes what must be given
+    if isinstance(value, tuple):
+        value = list(value)
+    try:
+        text = yaml.safe_dump(value, default_flow_style=True, width=10**6, allow_unicode=True)
+    except yaml.YAMLError:  # a default that only Python can write down
+        return "..."
+    return text.removesuffix("...\n").strip()
+
 
 Choices = dict[str, str | None]  # option by group
 

@@ -15,9 +15,9 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from nsm.config import checked, compose_config, composed, conf_folder, read_config
-from nsm.config_docs import known_keys
 from nsm.domains import Surface
 from nsm.errors import NotTrusted, NsmError
+from nsm.help import known_keys
 from nsm.instantiation import check_trusted, made
 from nsm.migration import OPTIONS, RENAMED
 from nsm.settings import Settings, parameters

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from nsm.config import composed, conf_folder
-from nsm.config_docs import groups, known_keys, option_settings, plain_settings
+from nsm.help import groups, known_keys, option_settings, plain_settings
 from nsm.settings import parts
 
 FILES = [file for file in sorted(conf_folder().rglob("*.yaml")) if file.parent != conf_folder()]
