@@ -14,7 +14,7 @@ import inspect
 import re
 import sys
 import types
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -27,9 +27,15 @@ from nsm.energies.distortion import of_invariants
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC, BLOCKS, Formula
 
+
+def _not_registered(name: str) -> Any:
+    message = "is not registered in this process; if it is yours, call nsm.register_... first"
+    raise AttributeError(f"{name!r} {message}")
+
+
 # a module of its own, so that ``_target_`` can name what is in it
 registered = types.ModuleType(f"{__name__}.registered")
-registered.__getattr__ = lambda name: _not_registered(name)  # type: ignore[method-assign]
+registered.__getattr__ = _not_registered  # type: ignore[method-assign]
 sys.modules[registered.__name__] = registered
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -150,7 +156,8 @@ def register_block(name: str, kind: Callable[[int, nn.Module], nn.Module]) -> No
     Raises:
         NsmError: a name that is taken or no name.
     """
-    _add("block", name, BLOCKS, kind)
+    _take("block", name, BLOCKS)
+    BLOCKS[name] = kind
 
 
 def register_analytic(name: str, function: Callable[..., tuple[Tensor, Tensor, Tensor]]) -> None:
@@ -169,7 +176,8 @@ def register_analytic(name: str, function: Callable[..., tuple[Tensor, Tensor, T
         >>> nsm.register_analytic("dune", lambda u, v, height=0.3: (u, v, height * (3 * u).sin()))
         >>> nsm.map_pair(phi, {"name": "dune", "height": 0.5})
     """
-    _add("analytic surface", name, ANALYTIC, partial(Formula, name, function))
+    _take("analytic surface", name, ANALYTIC)
+    ANALYTIC[name] = partial(Formula, name, function)
 
 
 def _register(
@@ -189,11 +197,6 @@ def _register(
     ConfigStore.instance().store(group=group, name=name, node=store, provider="nsm")
 
 
-def _add(kind: str, name: str, table: MutableMapping[str, Any], thing: Any) -> None:
-    _take(kind, name, table)
-    table[name] = thing
-
-
 def _take(kind: str, name: str, known: Any) -> None:
     """Take a name for a kind; one that is taken for it may be registered again, as notebooks do."""
     if not _NAME.fullmatch(name):
@@ -210,9 +213,3 @@ def _take(kind: str, name: str, known: Any) -> None:
             f"{kind} {name!r} exists already; take another name", kind="name_taken", key=name
         )
     _KINDS[name] = kind
-
-
-def _not_registered(name: str) -> Any:
-    raise AttributeError(
-        f"{name!r} is not registered in this process; if it is yours, call nsm.register_... first"
-    )
