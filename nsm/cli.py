@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from nsm.arguments import Arguments
-from nsm.config import checked, conf_folder, prepared_overrides, register, setting_error
+from nsm.config import conf_folder, prepared_overrides, register, setting_error
 from nsm.errors import NsmError, of_disk
 from nsm.plugins import import_here, import_plugins
 from nsm.run_directories import remove_empty
@@ -159,6 +159,8 @@ def _run(config: DictConfig) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
+        from nsm.config_validation import checked
+
         complete = checked(config, overrides)
         if complete.resume is not None:
             _check_alone(str(complete.resume), overrides)

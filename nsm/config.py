@@ -15,6 +15,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -49,15 +50,15 @@ def register() -> None:
             OmegaConf.set_struct(value, False)
     ConfigStore.instance().store(name="nsm_settings", node=node, provider="nsm")
     OmegaConf.register_new_resolver("nsm.run_folder", _run_folder, replace=True, use_cache=True)
-    OmegaConf.register_new_resolver("nsm.sweep_folder", _sweep_folder, replace=True)
+    OmegaConf.register_new_resolver(
+        "nsm.sweep_folder",
+        lambda task, overrides, params: sweep_folder(_task_name(task), overrides, params),
+        replace=True,
+    )
 
 
 def _task_name(task: Mapping[str, Any]) -> str:
     return str(task.get("name") or str(task.get("_target_", "task")).rpartition(".")[2].lower())
-
-
-def _sweep_folder(task: Any, overrides: Sequence[str], params: Any) -> str:
-    return sweep_folder(_task_name(task), overrides, params)
 
 
 def _run_folder(
@@ -66,11 +67,8 @@ def _run_folder(
     if resume is not None:
         return str(resume)
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    what = Path(surface["path"]).stem if surface.get("path") else str(surface.get("name"))
-    if surfaces is not None:
-        what = "-".join(_short_name(one) for one in surfaces)
-    elif target is not None:
-        what = "-".join(_short_name(end) for end in (source, target))
+    ends = (surface,) if target is None else (source, target)
+    what = "-".join(map(_short_name, ends if surfaces is None else surfaces))
     folder = f"outputs/{_task_name(task)}/{what[:_LONGEST_NAME]}-{stamp}"
     number, free = 2, folder
     while Path(free).exists():  # runs started within the same second
@@ -79,9 +77,9 @@ def _run_folder(
 
 
 def _short_name(surface: Any) -> str:
-    """A short name for what ``source`` or ``target`` names."""
+    """A short name for what ``surface``, ``source`` or ``target`` names."""
     if isinstance(surface, (dict, DictConfig)):
-        return str(surface.get("name"))
+        return Path(surface["path"]).stem if surface.get("path") else str(surface.get("name"))
     return Path(str(surface)).stem
 
 
@@ -100,10 +98,12 @@ def compose_config(
     Raises:
         NsmError: a setting that does not exist, or a value that does not fit.
     """
+    from nsm.config_validation import checked  # which imports torch
+
     config, _ = composed(overrides)
     if settings:
         OmegaConf.set_struct(config, False)
-        config = OmegaConf.merge(config, OmegaConf.create(dict(settings)))  # type: ignore[assignment]
+        config = OmegaConf.merge(config, dict(settings))  # type: ignore[assignment]
     return checked(config, [*overrides, *_dotted(settings or {})])
 
 
@@ -145,13 +145,6 @@ def _dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}={value}"
 
 
-def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
-    """As :func:`nsm.config_validation.checked`, which is imported here: it needs torch."""
-    from nsm.config_validation import checked
-
-    return checked(config, overrides)
-
-
 def prepared_overrides(overrides: Sequence[str]) -> list[str]:
     """Overrides with mesh files, and paths with special signs, in the form that Hydra takes.
 
@@ -169,7 +162,7 @@ def prepared_overrides(overrides: Sequence[str]) -> list[str]:
         if key == "surface" and all(map(_is_file, value.strip("'\"").split(","))):
             key = "surface.path"
         if key.lstrip("+") in _PATHS and not _readable(f"{key}={value}"):
-            value = _quoted(value)
+            value = QuotedString(value, Quote.double).with_quotes()
         prepared.append(f"{key}={value}" if equals or key == "surface.path" else override)
     return prepared
 
@@ -187,11 +180,6 @@ def _readable(override: str) -> bool:
     except HydraException:
         return False
     return True
-
-
-def _quoted(value: str) -> str:
-    escaped = re.sub(r'(\\*)"', r'\1\1\\"', value)  # a backslash before a quote or the end escapes
-    return '"' + re.sub(r"(\\+)$", r"\1\1", escaped) + '"'
 
 
 def read_config(file: Path) -> DictConfig:
@@ -239,43 +227,35 @@ def nearest(name: str, known: Sequence[str], otherwise: str = "") -> str:
 
 def setting_error(error: Exception) -> NsmError:
     """What Hydra or OmegaConf say of a setting, as an error in one line with the nearest name."""
-    text = str(error).strip()
-    first = text.splitlines()[0] if text else type(error).__name__
+    text = str(error).strip() or type(error).__name__
+    first = text.splitlines()[0]
     if isinstance(error, OverrideParseException):
-        override = str(error.override)
+        key = str(error.override)
         hint = "quote values with special signs, as in 'surface.path=\"a=b.obj\"'"
-        if "=" not in override:
+        if "=" not in key:
             hint = "give SETTING=VALUE; see nsm --help"
-        return NsmError(
-            f"{override}: not readable; {hint}", kind="unreadable_setting", key=override
-        )
-    several = re.search(r"Ambiguous value for argument '([^'=]+)=(.*)'$", first)
-    if several:
-        key, values = several.groups()
+        return NsmError(f"{key}: not readable; {hint}", kind="unreadable_setting", key=key)
+    if found := re.search(r"Ambiguous value for argument '([^'=]+)=(.*)'$", first):
+        key, values = found.groups()
         return NsmError(
             f"{key}={values}: several values; nsm -m runs each, {key}=[{values}] is a list, "
             f"'{key}=\"{values}\"' one value with commas",
             kind="several_values",
             key=key,
         )
-    unknown = re.search(r"Could not override '([^']+)'", text)
-    if unknown:
-        return unknown_setting(unknown.group(1))
-    present = re.search(r"An item is already at '([^']+)'", text)
-    if present:
-        key = present.group(1)
-        return NsmError(f"setting {key}: already there; omit the +", kind="already_set", key=key)
-    option = re.search(r"Could not find '([^']+)/([^'/]+)'", text)
-    if option:
-        group, name = option.groups()
-        names = re.findall(r"^\t(\S+)$", text, re.MULTILINE)
-        return NsmError(
-            f"{group}={name} does not exist; {nearest(name, names)}",
-            kind="unknown_option",
-            key=group,
-        )
-    key = getattr(error, "full_key", None) or None
-    return NsmError(f"setting {key}: {first}" if key else first, kind="wrong_type", key=key)
+    if found := re.search(r"Could not override '([^']+)'", text):
+        return unknown_setting(found[1])
+    if found := re.search(r"An item is already at '([^']+)'", text):
+        message = f"setting {found[1]}: already there; omit the +"
+        return NsmError(message, kind="already_set", key=found[1])
+    if found := re.search(r"Could not find '([^']+)/([^'/]+)'", text):
+        group, name = found.groups()
+        hint = nearest(name, re.findall(r"^\t(\S+)$", text, re.MULTILINE))
+        message = f"{group}={name} does not exist; {hint}"
+        return NsmError(message, kind="unknown_option", key=group)
+    setting = getattr(error, "full_key", None) or None
+    message = f"setting {setting}: {first}" if setting else first
+    return NsmError(message, kind="wrong_type", key=setting)
 
 
 def unknown_setting(key: str, known: Sequence[str] | None = None, what: str = "") -> NsmError:

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import difflib
 import math
-import random
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -75,10 +73,8 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
             raise unknown_setting(key)
     result: dict[str, Any] = {}
     for key in GROUPS:
-        if settings.get(key) or key != "energy":
-            result[key] = _target(key, key, settings.get(key), given)
-        else:
-            result[key] = None
+        absent = key == "energy" and not settings.get(key)
+        result[key] = None if absent else _target(key, key, settings.get(key), given)
     for key in COLLECTIONS:
         result[key] = {
             name: _target(f"{key}.{name}", key, node, given)
@@ -131,14 +127,15 @@ def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, 
         if k in result or result.get("_partial_") or "_args_" in result:
             continue
         if parameter.required:
-            raise NsmError(
-                f"setting {key}.{k}: {name} needs it; give {key}.{k}=VALUE",
-                kind="missing_setting",
-                key=f"{key}.{k}",
-            )
+            raise _missing(f"{key}.{k}", name)
         if (name.startswith("nsm.") or k in EXTRA.get(group, ())) and _is_plain(parameter.default):
             result[k] = _listed(parameter.default)
     return result
+
+
+def _missing(key: str, what: str) -> NsmError:
+    message = f"setting {key}: {what} needs it; give {key}=VALUE"
+    return NsmError(message, kind="missing_setting", key=key)
 
 
 def takes(group: str, thing: Any) -> tuple[dict[str, Parameter], bool]:
@@ -179,12 +176,7 @@ def _part(key: str, node: Any, known: Mapping[str, Parameter], what: str = "") -
     result = {}
     for name, parameter in known.items():
         if name not in given and parameter.required:
-            dotted = f"{key}.{name}"
-            raise NsmError(
-                f"setting {dotted}: {what or 'the run'} needs it; give {dotted}=VALUE",
-                kind="missing_setting",
-                key=dotted,
-            )
+            raise _missing(f"{key}.{name}", what or "the run")
         result[name] = _fit(f"{key}.{name}", given.get(name, parameter.default), parameter)
     return result
 
@@ -269,6 +261,8 @@ def _check_values(key: str, value: Any) -> None:
 
 def _build(settings: dict[str, Any]) -> None:
     """Make once, in small, what the settings name: the code itself knows which values it takes."""
+    from pytorch_lightning.utilities.seed import isolate_rng
+
     from nsm.maps.networks import build_network
     from nsm.tasks.optimizers import build_optimizer
     from nsm.tasks.schedules import build_scheduler
@@ -280,7 +274,7 @@ def _build(settings: dict[str, Any]) -> None:
             kind="out_of_range",
             key="sampler.domain_share",
         )
-    with _same_random_numbers():
+    with isolate_rng(include_cuda=False):
         parts = {key: settings[key] for key in ("map", "activation", "encoding")}
         with _blamed("map", parts):
             network = build_network(**parts)
@@ -292,18 +286,6 @@ def _build(settings: dict[str, Any]) -> None:
             if settings[key]:
                 with _blamed(key):
                     made(settings[key])
-
-
-@contextmanager
-def _same_random_numbers() -> Iterator[None]:
-    """Leave the random numbers of torch, numpy and Python as they were."""
-    states = random.getstate(), np.random.get_state()
-    try:
-        with torch.random.fork_rng(devices=[]):
-            yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])
 
 
 @contextmanager

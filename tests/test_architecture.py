@@ -17,7 +17,14 @@ INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}
 # a run knows its configuration, its folder, the sweep that it belongs to and the user's modules;
 # results of older versions are lifted by the table of old names
 BESIDE = {
-    "pipeline": {"config", "migration", "plugins", "run_directories", "sweeps"},
+    "pipeline": {
+        "config",
+        "config_validation",
+        "migration",
+        "plugins",
+        "run_directories",
+        "sweeps",
+    },
     "results": {"migration"},
 }
 

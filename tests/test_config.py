@@ -14,7 +14,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from nsm.config import checked, compose_config, composed, conf_folder, read_config
+from nsm.config import compose_config, composed, conf_folder, read_config
+from nsm.config_validation import checked
 from nsm.domains import Surface
 from nsm.errors import NotTrusted, NsmError
 from nsm.help import known_keys

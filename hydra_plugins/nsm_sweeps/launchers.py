@@ -68,7 +68,7 @@ class SweepLauncher(Launcher):
         raise NotImplementedError
 
     def _job(self, overrides: Sequence[str]) -> Job:
-        from nsm.config import checked
+        from nsm.config_validation import checked
 
         hydra = self.config.hydra
         keys = swept_keys(hydra.overrides.task, hydra.sweeper.params)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 
-from nsm.config import checked
+from nsm.config_validation import checked
 from nsm.errors import NsmError
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.runner import run_task

@@ -16,7 +16,8 @@ from pytorch_lightning.loggers import Logger
 from rich.console import Console
 from torch.multiprocessing.spawn import ProcessRaisedException
 
-from nsm.config import checked, read_config
+from nsm.config import read_config
+from nsm.config_validation import checked
 from nsm.errors import NsmError
 from nsm.instantiation import check_trusted, made
 from nsm.pipeline.checkpoints import CHECKPOINT_FILE, not_a_checkpoint, stored_state
