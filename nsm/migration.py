@@ -109,6 +109,13 @@ def check_override(key: str, value: str) -> None:
         raise NsmError(message, kind="renamed_setting", key=bare)
 
 
+def check_weights(key: str) -> None:
+    """NsmError, with the new form, for ``energy.weights`` of an energy that is no blend."""
+    if key == "energy.weights":
+        message = "a blend is an energy; give energy._target_=nsm.energies.Blend with them"
+        raise NsmError(f"setting {key}: {message}", kind="renamed_setting", key=key)
+
+
 def migrated(settings: Any) -> dict[str, Any]:
     """The settings of an older run, as this version has them; those of this version unchanged.
 
