@@ -95,7 +95,9 @@ def check_override(key: str, value: str) -> None:
     group, _, last = bare.rpartition(".")
     new = {
         "logger.kinds": "logger=tensorboard, csv, both, wandb, mlflow or none",
-        "trainer": "trainer.SETTING=VALUE, as it is no group any more",
+        "trainer": "trainer.SETTING=VALUE, as it is no group any more"
+        if value == "default"
+        else "",
     }.get(bare)
     if last == "name" and value in TARGETS.get(group, ()):
         new = f"{group}={value}"

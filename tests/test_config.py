@@ -344,7 +344,9 @@ def test_paths_with_special_signs(name):
     assert composed(["surface=cow"])[0].surface.path is None
 
 
-@pytest.mark.parametrize("old", [*RENAMED, *OPTIONS, ("optimizer.name", "adam")])
+@pytest.mark.parametrize(
+    "old", [*RENAMED, *OPTIONS, ("optimizer.name", "adam"), ("trainer", "default")]
+)
 def test_an_old_name_is_answered_with_the_new_one(old):
     key, value = old if isinstance(old, tuple) else (old, "1")
     with pytest.raises(NsmError) as error:
