@@ -54,8 +54,13 @@ class Group:
     options: dict[str, str]
 
 
-def groups() -> list[Group]:
-    """All groups in the order of the defaults list, but for the task, which comes first."""
+def groups(own: Path | None = None) -> list[Group]:
+    """All groups in the order of the defaults list, but for the task, which comes first.
+
+    Args:
+        own: the user's folder, with options beside those of nsm.
+    """
+    folders = [conf_folder(), *([own] if own else [])]
     found, remark = [], []
     for line in (conf_folder() / "config.yaml").read_text(encoding="utf-8").splitlines():
         entry = _DEFAULT.match(line)
@@ -64,7 +69,9 @@ def groups() -> list[Group]:
         elif entry:
             if remark:  # the others are Hydra's, and no choice of ours
                 name, default = entry.groups()
-                files = sorted((conf_folder() / name).glob("*.yaml"))
+                files = sorted(
+                    file for folder in folders for file in (folder / name).glob("*.yaml")
+                )
                 options = {file.stem: _first_comment(file) for file in files}
                 found.append(Group(name, " ".join(remark), default, options))
             remark = []
@@ -77,14 +84,20 @@ def _first_comment(file: Path) -> str:
     return comments[0].strip("# ") if comments else ""
 
 
-def option_settings(group: str, name: str, run: Mapping[str, Any] | None = None) -> list[Setting]:
+def option_settings(
+    group: str, name: str, run: Mapping[str, Any] | None = None, own: Path | None = None
+) -> list[Setting]:
     """The settings of an option, with their values.
 
     Args:
         group, name: of the option.
         run: the configuration of a run that has chosen it, whose values are shown then.
+        own: the user's folder of options; nsm's take precedence, as in a run.
     """
-    text = (conf_folder() / group / f"{name}.yaml").read_text(encoding="utf-8")
+    file = conf_folder() / group / f"{name}.yaml"
+    if own and not file.is_file():
+        file = own / group / f"{name}.yaml"
+    text = file.read_text(encoding="utf-8")
     package = _PACKAGE.match(text)
     node: Any = OmegaConf.to_container(OmegaConf.create(text))
     node.pop("defaults", None)
@@ -216,12 +229,13 @@ answered in one line, with exit status 2. Completion: eval "$(nsm -sc install=ba
 bashcompinit; fish: nsm -sc install=fish | source). Hydra's own flags: --hydra-help."""
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: list[str], own: Path | None = None) -> None:
     """Print the help on the groups and settings that arguments name, or on all groups in short.
 
     Args:
         arguments: names; and overrides, which change the values that are shown. Without a name,
             the settings that the overrides set are the names.
+        own: the user's folder of options, beside those of nsm.
 
     Raises:
         NsmError: a name of neither a group nor a setting.
@@ -229,11 +243,12 @@ def main(arguments: list[str]) -> None:
     overrides = [argument for argument in arguments if "=" in argument]
     names = [argument for argument in arguments if "=" not in argument]
     names = names or [override.partition("=")[0].lstrip("+~") for override in overrides]
-    config, chosen = composed(overrides)
+    search = [f"hydra.searchpath=['file://{own.absolute()}']"] if own else []
+    config, chosen = composed([*search, *overrides])
     run: Any = OmegaConf.to_container(config)
     console = Console(highlight=False, soft_wrap=False)
     for name in names:
-        if not _explained(console, name, run, chosen):
+        if not _explained(console, name, run, chosen, own):
             hint = nearest(name, known_keys(), "see nsm --help")
             message = f"--help {name}: no such group or setting; {hint}"
             raise NsmError(message, kind="unknown_setting", key=name)
@@ -241,7 +256,7 @@ def main(arguments: list[str]) -> None:
         return
     console.print(_USAGE)
     console.print("\n[bold]Groups[/bold] and their options, * by default\n")
-    for group in groups():
+    for group in groups(own):
         _heading(console, group)
         console.print(_options(group, chosen))
         console.print()
@@ -251,7 +266,9 @@ def main(arguments: list[str]) -> None:
     console.print(_CLOSING)
 
 
-def _explained(console: Console, name: str, run: dict[str, Any], chosen: Choices) -> bool:
+def _explained(
+    console: Console, name: str, run: dict[str, Any], chosen: Choices, own: Path | None
+) -> bool:
     """Print a group, a setting or the settings below a name; False if there is none."""
 
     def named(settings: list[Setting]) -> list[Setting]:
@@ -262,7 +279,7 @@ def _explained(console: Console, name: str, run: dict[str, Any], chosen: Choices
         _settings(console, outside)
         console.print()
     found = bool(outside)
-    for group in groups():
+    for group in groups(own):
         key = group.name.replace("/", ".")
         whole = name in (group.name, key)
         if not whole and not name.startswith(f"{key}.") and group.name not in _OVER_OTHERS:
@@ -273,7 +290,7 @@ def _explained(console: Console, name: str, run: dict[str, Any], chosen: Choices
             console.print()
         for option in group.options:
             is_chosen = chosen.get(group.name) == option
-            settings = option_settings(group.name, option, run if is_chosen else None)
+            settings = option_settings(group.name, option, run if is_chosen else None, own)
             shown = settings if whole else named(settings)
             if whole or shown:
                 found = True
