@@ -52,7 +52,7 @@ def register() -> None:
     OmegaConf.register_new_resolver("nsm.run_folder", _run_folder, replace=True, use_cache=True)
     OmegaConf.register_new_resolver(
         "nsm.sweep_folder",
-        lambda task, overrides, params: sweep_folder(_task_name(task), overrides, params),
+        lambda task, overrides: sweep_folder(_task_name(task), overrides),
         replace=True,
     )
 

@@ -77,17 +77,18 @@ def swept_keys(arguments: Iterable[str], params: Mapping[str, Any] | None) -> li
     return [o.get_key_element() for o in overrides_of(arguments, params) if o.is_sweep_override()]
 
 
-def sweep_folder(task: str, arguments: Sequence[str], params: Mapping[str, Any] | None) -> str:
+def sweep_folder(task: str, arguments: Sequence[str]) -> str:
     """``outputs/TASK/sweep-WHAT`` with a hash of the fixed settings.
 
     The swept values have no part in it, so that a sweep can be widened in its folder.
     """
     preset = [one.split("=")[1] for one in arguments if one.startswith("sweep=")]
-    swept = [o.get_key_element() for o in overrides_of(arguments, {}) if o.is_sweep_override()]
+    given = overrides_of(arguments, {})
+    swept = [o.get_key_element() for o in given if o.is_sweep_override()]
     name = _name([*preset, *(key.split(".")[-1] for key in swept)]) or "one"
     fixed = [
         str(o.input_line)
-        for o in overrides_of(arguments, {})
+        for o in given
         if not o.is_sweep_override() and not str(o.input_line).startswith("sweep=")
     ]
     parts = ["sweep", name, *([_hash(sorted(fixed))] if fixed else [])]

@@ -168,10 +168,10 @@ def test_a_preset_is_a_sweep_without_further_words(tmp_path, here):
 
 
 def test_folders_follow_from_the_settings(tmp_path):
-    wide = sweep_folder("overfit", ["activation=relu,silu", "seed=3", "surface=cow"], None)
-    assert wide == sweep_folder("overfit", ["surface=cow", "activation=tanh,relu", "seed=3"], None)
-    assert wide != sweep_folder("overfit", ["surface=cow", "activation=tanh,relu", "seed=4"], None)
-    assert sweep_folder("overfit", ["sweep=activation"], {}) == "outputs/overfit/sweep-activation"
+    wide = sweep_folder("overfit", ["activation=relu,silu", "seed=3", "surface=cow"])
+    assert wide == sweep_folder("overfit", ["surface=cow", "activation=tanh,relu", "seed=3"])
+    assert wide != sweep_folder("overfit", ["surface=cow", "activation=tanh,relu", "seed=4"])
+    assert sweep_folder("overfit", ["sweep=activation"]) == "outputs/overfit/sweep-activation"
     one = job_folder(tmp_path, {"seed": 1, "map": {"width": 3}}, ["seed=1"])
     one.mkdir()
     assert job_folder(tmp_path, {"map": {"width": 3}, "seed": 1}, ["map.width=3"]) == one

@@ -82,7 +82,7 @@ def _reinsert(
     inner = step.before < 0
     place = np.empty((len(step.vertex), 2))
     place[inner] = _mean_values(vertices, uv, stars)[inner]
-    place[~inner] = _between(vertices, uv, freedom, step, ~inner)
+    place[~inner] = _between(vertices, uv, step, ~inner)
     fits = _placed(uv, stars, step, place, freedom)
     # near the target there is always room, though not in every direction
     left, step_left = stars.subset(~fits), step.subset(~fits)
@@ -153,9 +153,7 @@ def _mean_values(vertices: np.ndarray, uv: np.ndarray, stars: Stars) -> np.ndarr
     return np.stack([total(uv[stars.b, i], uv[stars.c, i]) / weight for i in range(2)], axis=1)
 
 
-def _between(
-    vertices: np.ndarray, uv: np.ndarray, freedom: Freedom, step: Round, which: np.ndarray
-) -> np.ndarray:
+def _between(vertices: np.ndarray, uv: np.ndarray, step: Round, which: np.ndarray) -> np.ndarray:
     """Places (K, 2) on ∂Ω between two neighbours, at the shares of length that the mesh has."""
     v, w, a = step.vertex[which], step.target[which], step.before[which]
     after = np.linalg.norm(vertices[v] - vertices[w], axis=1)
