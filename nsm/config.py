@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nsm.errors import NsmError
 from nsm.migration import check_override, migrated
-from nsm.settings import conf_folder, defaults
+from nsm.settings import Settings, conf_folder
 from nsm.sweeps import sweep_folder
 
 # groups of which an option is one ``_target_``, and those that hold several of them by name
@@ -44,7 +45,8 @@ def register() -> None:
 
     Mappings are open: the check knows which keys they may have, and names the nearest.
     """
-    node = OmegaConf.create({**defaults(), **{key: {} for key in (*GROUPS, "logger", *_WEIGHTS)}})
+    groups: dict[str, Any] = dict.fromkeys((*GROUPS, "logger", *_WEIGHTS), {})
+    node = OmegaConf.create({**asdict(Settings()), **groups})
     for value in node.values():
         if isinstance(value, DictConfig):
             OmegaConf.set_struct(value, False)

@@ -42,17 +42,6 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _KINDS: dict[str, str] = {}  # of each registered name
 
 
-class _Elementwise(nn.Module):
-    """A function z ↦ f(z) of numbers as a module."""
-
-    def __init__(self, function: Callable[..., Tensor], parameters: dict[str, Any]) -> None:
-        super().__init__()
-        self.function, self.parameters_ = function, parameters
-
-    def forward(self, z: Tensor) -> Tensor:
-        return self.function(z, **self.parameters_)
-
-
 def register_energy(name: str, formula: Callable[[Invariants], Tensor]) -> None:
     """Make a distortion energy known as ``energy=NAME``.
 
@@ -100,14 +89,14 @@ def register_activation(name: str, function: Callable[..., Any] | nn.Module) -> 
     elif inspect.isclass(function):
         _register("activation", name, function)
     else:
-        _register("activation", name, _module_of(name, function))
+        _register("activation", name, _maker_of(name, function))
 
 
-def _module_of(name: str, function: Callable[..., Tensor]) -> Callable[..., nn.Module]:
-    """From the settings of an activation that is a function to a module."""
+def _maker_of(name: str, function: Callable[..., Tensor]) -> Callable[..., Callable[..., Tensor]]:
+    """From the settings of an activation that is a function to a function of z alone."""
 
-    def make(**settings: Any) -> nn.Module:
-        return _Elementwise(function, settings)
+    def make(**settings: Any) -> Callable[..., Tensor]:
+        return partial(function, **settings)
 
     try:
         parameters = list(inspect.signature(function).parameters.values())[1:]

@@ -11,7 +11,7 @@ import inspect
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -423,11 +423,6 @@ def conf_folder() -> Path:
     package = Path(__file__).parent
     installed = package / "conf"
     return installed if installed.is_dir() else package.parent / "conf"
-
-
-def defaults() -> dict[str, Any]:
-    """The defaults of all plain settings, as dictionaries."""
-    return asdict(Settings())
 
 
 def parts() -> dict[str, type]:
