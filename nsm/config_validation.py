@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import difflib
 import math
+import random
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -270,8 +272,6 @@ def _check_values(key: str, value: Any) -> None:
 
 def _build(settings: dict[str, Any]) -> None:
     """Make once, in small, what the settings name: the code itself knows which values it takes."""
-    from pytorch_lightning.utilities.seed import isolate_rng
-
     from nsm.maps.networks import build_network
     from nsm.tasks.optimizers import build_optimizer
     from nsm.tasks.schedules import build_scheduler
@@ -283,7 +283,7 @@ def _build(settings: dict[str, Any]) -> None:
             kind="out_of_range",
             key="sampler.domain_share",
         )
-    with isolate_rng(include_cuda=False):
+    with _same_random_numbers():
         parts = {key: settings[key] for key in ("map", "activation", "encoding")}
         with _blamed("map", parts):
             network = build_network(**parts)
@@ -295,6 +295,18 @@ def _build(settings: dict[str, Any]) -> None:
             if settings[key]:
                 with _blamed(key):
                     made(settings[key])
+
+
+@contextmanager
+def _same_random_numbers() -> Iterator[None]:
+    """Leave the random numbers of torch, numpy and Python as they were, after errors too."""
+    states = random.getstate(), np.random.get_state()
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])
 
 
 @contextmanager
