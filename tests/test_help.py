@@ -93,7 +93,7 @@ def test_help_on_plain_settings(here, name):
 
 
 def test_help_near_a_setting(here):
-    for name, near in (("encodin", "'encoding'"), ("trainer.max_step", "'trainer.max_steps'")):
+    for name, near in (("encodin", "encoding"), ("trainer.max_step", "trainer.max_steps")):
         result = here("--help", name)
         assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
         assert near in result.stderr

@@ -209,8 +209,6 @@ def test_code_of_a_file_runs_if_its_module_is_trusted(copy, mine):
     with pytest.raises(NsmError) as refused:
         nsm.load(copy)
     assert (refused.value.kind, refused.value.key) == ("not_trusted", "mine_for_test")
-    for flag in ("trust=mine_for_test", "--trust mine_for_test"):
-        assert flag in str(refused.value)
     assert not mine.exists()
     for trust in ("mine_for_test", ["mine_for_test"]):
         phi = nsm.load(copy, trust=trust)
@@ -224,7 +222,7 @@ def test_what_is_trusted_now_is_not_taken_from_a_file(copy, mine, here):
     settings["trust"] = ["mine_for_test"]
     file.write_text(yaml.safe_dump(settings))
     refused = here(f"resume={copy}")
-    assert refused.returncode == 2 and "trust=mine_for_test" in refused.stderr
+    assert refused.returncode == 2 and "mine_for_test" in refused.stderr
     assert not mine.exists()
 
 
@@ -365,7 +363,7 @@ def test_folders_without_a_result(finished, copy, tmp_path):
     for folder in (tmp_path, copy, tmp_path / "empty", tmp_path / "other", tmp_path / "not there"):
         with pytest.raises(NsmError) as refused:
             nsm.load(folder)
-        assert refused.value.kind == "missing_file" and str(folder) in str(refused.value)
+        assert (refused.value.kind, refused.value.key) == ("missing_file", str(folder))
 
 
 def test_mistaken_arguments_in_python(tmp_path):

@@ -113,7 +113,7 @@ def test_landmarks(width):
 
 
 def test_landmarks_must_match():
-    with pytest.raises(ValueError, match="landmarks"):
+    with pytest.raises(ValueError, match="targets"):
         landmark(torch.zeros(3, 2), torch.zeros(1, 2))
 
 

@@ -248,7 +248,7 @@ def test_collapse_to_a_point_is_never_good(name, worst):
 def test_wrong_shapes_are_refused(shape):
     good, bad = torch.ones(4, 2, 2), torch.ones(shape)
     for source, target in ((bad, good), (good, bad)):
-        with pytest.raises(ValueError, match="metric"):
+        with pytest.raises(ValueError):
             ENERGIES["mips"]()(source, target)
 
 

@@ -65,5 +65,5 @@ def test_is_the_identity_where_nothing_decides(p, q):
 
 @pytest.mark.parametrize("shapes", [((3, 2), (2, 2)), ((3, 3), (3, 3)), ((2,), (2,))])
 def test_shapes_must_match(shapes):
-    with pytest.raises(ValueError, match="landmarks"):
+    with pytest.raises(ValueError):
         rotation(torch.ones(shapes[0]), torch.ones(shapes[1]))

@@ -131,7 +131,7 @@ def test_corrections_that_fit_no_map_are_refused(folded, tmp_path):
         Correction(np.array([0]), np.full((1, 2), np.nan)),
         Correction(np.array([0, 1]), np.zeros((1, 2))),
     ):
-        with pytest.raises(ValueError, match="correct"):
+        with pytest.raises(ValueError):
             Correction.taken(wrong.tensors(), len(folded.image_uv))
     from dataclasses import replace
 

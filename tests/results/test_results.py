@@ -1,7 +1,9 @@
 """Figures against closed forms, artefacts against damage, exports and pictures read back."""
 
+import errno
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,7 +215,7 @@ def test_a_damaged_artefact_is_refused_in_one_line(neural, tmp_path, damage, kin
         load_surface(tmp_path)
     assert refused.value.kind == kind
     assert "\n" not in str(refused.value)
-    assert str(tmp_path) in str(refused.value)
+    assert Path(refused.value.key).is_relative_to(tmp_path)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -221,11 +223,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     atomic_write(file, b"old")
 
     def full(descriptor):
-        raise OSError(28, "No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError) as error:
         atomic_write(file, b"new")
+    assert error.value.errno == errno.ENOSPC
     assert file.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [file]
 

@@ -16,7 +16,7 @@ def refusal(path) -> str:
     with pytest.raises(NsmError) as caught:
         load_mesh(path)
     assert caught.value.key == str(path)
-    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value)
     return caught.value.kind
 
 
