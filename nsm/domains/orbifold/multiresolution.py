@@ -1,0 +1,278 @@
+"""Closed meshes laid out on R²/Γ coarse first: the coarse mesh is solved for, the rest put back in.
+
+On the full mesh Tutte's embedding squeezes limbs to nothing, exponentially in their length, and
+no descent comes back from there. On a few hundred triangles it does not; each round of
+:mod:`nsm.surfaces.coarsening` is then undone without a flip, and relaxed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.newton import Quotient
+from nsm.domains.orbifold.sweeps import Stars, colour_classes, relax
+from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+from nsm.surfaces.coarsening import Round, coarsen, undo
+
+AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lattice has 4
+_LATTICE = 4.0
+_GROWTH = 2.0  # of the faces between two relaxations of all vertices
+_STEPS = 2  # of Newton's method on what was put back
+_NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
+_TRIES = 60
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is done: faces of the coarsest mesh; steps there, on each level, and at the end;
+    up to how many vertices a level gets global steps; sweeps where it does not."""
+
+    coarsest: int = 500
+    first: int = 60
+    level: int = 4
+    last: int = 15
+    largest: int = 40_000
+    sweeps: int = 6
+    stop: float = 1e-4  # relative decrease of the energy in a step
+
+
+@dataclass
+class Layout:
+    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns."""
+
+    lift: np.ndarray
+    uv: np.ndarray
+    lattice: np.ndarray
+
+    def shaped(self, matrix: np.ndarray) -> None:
+        """Apply a linear map (2, 2) to the plane."""
+        self.uv = self.uv @ matrix.T
+        self.lattice = matrix @ self.lattice
+
+
+def laid_out(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    lift: np.ndarray,
+    cones: np.ndarray | None,
+    weights: str = "mean_value",
+    effort: Effort | None = None,
+) -> Layout:
+    """Lay a closed mesh (V, 3), (F, 3) out with little symmetric Dirichlet energy, no flips.
+
+    Args:
+        lift: (F, 3, 3); the result's may have other canonical coordinates.
+        cones: (4,) vertices; None for a torus.
+        weights: of the first embedding, see :func:`tutte.edge_weights`.
+    """
+    effort = effort or Effort()
+    held = np.zeros(len(vertices), dtype=bool)
+    held[faces[0, 0] if cones is None else cones] = True
+    current, rounds = coarsen(vertices, faces, held, effort.coarsest)
+    layout = Layout(_regauged(faces, lift, rounds), np.zeros((len(vertices), 2)), np.eye(2))
+    area = AREA[cones is not None]
+    alive = _alive(current)
+    _first(vertices, current[alive], alive, layout, cones, weights, area)
+    relax_all(vertices, current, alive, layout, held, area, effort, effort.first)
+    done = len(alive)
+    for step in reversed(rounds):
+        undo(current, step)
+        alive = _alive(current)
+        scaled = _scaled(vertices, current[alive], area)
+        _put_back(scaled, current, layout, step)
+        last = step is rounds[0]
+        if last or len(alive) >= _GROWTH * done:
+            done = len(alive)
+            steps = effort.last if last else effort.level
+            relax_all(vertices, current, alive, layout, held, area, effort, steps)
+    return layout
+
+
+def relax_all(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    alive: np.ndarray,
+    layout: Layout,
+    held: np.ndarray,
+    area: float,
+    effort: Effort,
+    steps: int,
+) -> None:
+    """Lower the energy of those of the faces that are alive, by global steps or by sweeps."""
+    present, lift = faces[alive], layout.lift[alive]
+    scaled = _scaled(vertices, present, area)
+    small = len(present) <= 2 * effort.largest
+    classes: list[Stars] | None = None
+    quotient = Quotient(scaled, present, lift, held) if small else None
+    if quotient is None:
+        classes = list(colour_classes(scaled, present, lift, held))
+        shape = _Shape(scaled, present, lift)
+        for _ in range(effort.sweeps):
+            layout.shaped(shape.best(layout))
+            for stars in classes:
+                relax(layout.uv, layout.lattice, stars)
+        return
+    before = np.inf
+    for _ in range(steps):
+        layout.shaped(quotient.best_shape(layout.uv, layout.lattice))
+        layout.uv, energy, size = quotient.step(layout.uv, layout.lattice)
+        if size < 0.1:
+            # the worst triangles hold everything up: move their vertices on their own
+            classes = classes or list(colour_classes(scaled, present, lift, held))
+            for stars in classes:
+                relax(layout.uv, layout.lattice, stars)
+        elif before - energy < effort.stop * energy:
+            break
+        before = energy
+
+
+class _Shape:
+    """The best shape of the lattice for meshes too large to need second derivatives."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, lift: np.ndarray) -> None:
+        self.quotient = object.__new__(Quotient)
+        Quotient.prepare(self.quotient, vertices, faces, lift)
+
+    def best(self, layout: Layout) -> np.ndarray:
+        return self.quotient.best_shape(layout.uv, layout.lattice)
+
+
+def _alive(faces: np.ndarray) -> np.ndarray:
+    a, b, c = faces.T
+    return np.flatnonzero((a != b) & (b != c) & (c != a))
+
+
+def _scaled(vertices: np.ndarray, faces: np.ndarray, area: float) -> np.ndarray:
+    return vertices * np.sqrt(area / topology.face_areas(vertices, faces).sum())
+
+
+def _first(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    alive: np.ndarray,
+    layout: Layout,
+    cones: np.ndarray | None,
+    weights: str,
+    area: float,
+) -> None:
+    """Tutte's embedding of the coarsest mesh."""
+    ids, local = topology.renumbered(faces, len(vertices))
+    weight = edge_weights(vertices, faces, weights)
+    of_cones = None if cones is None else local[cones]
+    x, quadratic = tutte(local[faces], layout.lift[alive], weight, of_cones)
+    layout.lattice = best_lattice(quadratic, _LATTICE)
+    layout.uv[ids] = x @ layout.lattice.T
+
+
+def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.ndarray:
+    """Lifts (F, 3, 3) with canonical coordinates such that a vertex and the one that it is drawn
+    into have the same lift in the triangles they share: lifts then stay as corners change names."""
+    gauge = group.identities(lift.shape[0] and int(faces.max()) + 1)
+    current, into = faces.copy(), np.arange(len(gauge))
+    for step in rounds:
+        face, k = step.corners // 3, step.corners % 3
+        here = current[face] == step.target[step.star][:, None]
+        shared = np.flatnonzero(here.any(axis=1))
+        which = np.unique(step.star[shared], return_index=True)[1]
+        row = shared[which]
+        f, kv, kw = face[row], k[row], here[row].argmax(axis=1)
+
+        def now(f: np.ndarray, k: np.ndarray) -> np.ndarray:
+            return group.compose(lift[f, k], group.inverse(gauge[faces[f, k]]))
+
+        change = group.compose(group.inverse(now(f, kw)), now(f, kv))
+        number = np.full(len(gauge), -1)
+        number[step.vertex] = np.arange(len(step.vertex))
+        members = np.flatnonzero(number[into] >= 0)
+        mine = number[into[members]]
+        gauge[members] = group.compose(change[mine], gauge[members])
+        into[members] = step.target[mine]
+        current.ravel()[step.corners] = step.target[step.star]
+    return group.compose(lift, group.inverse(gauge[faces]))
+
+
+def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Round) -> None:
+    """Give a round's vertices places that flip no triangle."""
+    stars = Stars(vertices, faces, layout.lift, step.vertex, step.corners, step.star)
+    uv, lattice = layout.uv, layout.lattice
+    b, c = stars.rings(uv, lattice)
+    target = uv[step.target]
+    place = _mean_values(vertices, stars, b, c)
+    missing = _placed(uv, stars, b, c, target, place)
+    if len(missing):
+        inwards = _inwards(stars, step, b, c, target, place)
+        keep = np.zeros(len(target), dtype=bool)
+        keep[missing] = True
+        corners = keep[stars.star]
+        left = stars.chosen(keep)
+        if len(_placed(uv, left, b[corners], c[corners], target[keep], inwards[keep])):
+            raise NsmError("a vertex finds no place without a flip", kind="not_injective")
+    for _ in range(_STEPS):
+        relax(uv, lattice, stars)
+
+
+def _placed(
+    uv: np.ndarray,
+    stars: Stars,
+    b: np.ndarray,
+    c: np.ndarray,
+    target: np.ndarray,
+    place: np.ndarray,
+) -> np.ndarray:
+    """Move each middle to its place (N, 2), or as near to it from its target as it flips nothing;
+    numbers of those that found no place."""
+    missing, share = np.arange(len(place)), 1.0
+    for _ in range(_TRIES):
+        trial = target + share * (place - target)
+        with np.errstate(all="ignore"):
+            fits = np.isfinite(stars.energy(b, c, trial))
+        uv[stars.vertex[fits]] = trial[fits]
+        corners, left = ~fits[stars.star], ~fits
+        stars, b, c = stars.chosen(left), b[corners], c[corners]
+        target, place, missing = target[left], place[left], missing[left]
+        if len(missing) == 0:
+            break
+        share *= _NEARER
+    return missing
+
+
+def _inwards(
+    stars: Stars,
+    step: Round,
+    b: np.ndarray,
+    c: np.ndarray,
+    target: np.ndarray,
+    place: np.ndarray,
+) -> np.ndarray:
+    """Places (N, 2) as far from their targets as the given ones, but between the sides there."""
+    of_star = step.target[stars.star]
+    left = np.zeros_like(place)
+    for which in (stars.b == of_star, stars.c == of_star):
+        side = (c - b)[which]
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        np.add.at(left, stars.star[which], np.stack([-side[:, 1], side[:, 0]], axis=1))
+    length = np.linalg.norm(left, axis=1).clip(1e-300)
+    return target + (np.linalg.norm(place - target, axis=1) / length)[:, None] * left
+
+
+def _mean_values(vertices: np.ndarray, stars: Stars, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """The mean (N, 2) of each star's ring with mean value weights (Floater 2003)."""
+    p = vertices[stars.vertex[stars.star]]
+    to_b, to_c = vertices[stars.b] - p, vertices[stars.c] - p
+    lb, lc = (np.maximum(np.linalg.norm(e, axis=1), 1e-12) for e in (to_b, to_c))
+    # tangent of half the angle at the middle; 1 / d is twice the area
+    half = (1 / stars.d) / (lb * lc + (to_b * to_c).sum(axis=1)).clip(1e-300)
+    half = half.clip(1e-6, 1e6)
+    n = len(stars.vertex)
+
+    def total(of_b: np.ndarray, of_c: np.ndarray) -> np.ndarray:
+        return np.bincount(stars.star, weights=half * (of_b / lb + of_c / lc), minlength=n)
+
+    ones = np.ones(len(lb))
+    weight = total(ones, ones)
+    return np.stack([total(b[:, i], c[:, i]) / weight for i in range(2)], axis=1)
