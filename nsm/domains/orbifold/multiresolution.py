@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.domains.orbifold import group
+from nsm.domains.orbifold.collapses import collapsed
 from nsm.domains.orbifold.newton import Quotient
 from nsm.domains.orbifold.sweeps import Stars, colour_classes, relax
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
@@ -21,7 +22,6 @@ from nsm.surfaces.coarsening import Round, coarsen, undo
 
 AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lattice has 4
 _LATTICE = 4.0
-_GROWTH = 2.0  # of the faces between two relaxations of all vertices
 _STEPS = 2  # of Newton's method on what was put back
 _NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
 _TRIES = 60
@@ -29,15 +29,17 @@ _TRIES = 60
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done: faces of the coarsest mesh; steps there, on each level, and at the end;
-    up to how many vertices a level gets global steps; sweeps where it does not."""
+    """How much is done: faces of the first coarse mesh, whose shape is that of the surface, and of
+    the last; steps on each level, and at the end; up to how many vertices a level gets global
+    steps; sweeps where it does not."""
 
-    coarsest: int = 500
-    first: int = 60
-    level: int = 4
+    coarse: int = 500
+    coarsest: int = 20
+    level: int = 5
     last: int = 15
     largest: int = 40_000
     sweeps: int = 6
+    growth: float = 2.0  # of the faces between two relaxations of all vertices
     stop: float = 1e-4  # relative decrease of the energy in a step
 
 
@@ -60,7 +62,7 @@ def laid_out(
     faces: np.ndarray,
     lift: np.ndarray,
     cones: np.ndarray | None,
-    weights: str = "mean_value",
+    weights: str = "uniform",
     effort: Effort | None = None,
 ) -> Layout:
     """Lay a closed mesh (V, 3), (F, 3) out with little symmetric Dirichlet energy, no flips.
@@ -73,24 +75,51 @@ def laid_out(
     effort = effort or Effort()
     held = np.zeros(len(vertices), dtype=bool)
     held[faces[0, 0] if cones is None else cones] = True
-    current, rounds = coarsen(vertices, faces, held, effort.coarsest)
-    layout = Layout(_regauged(faces, lift, rounds), np.zeros((len(vertices), 2)), np.eye(2))
     area = AREA[cones is not None]
+    current, rounds = coarsen(vertices, faces, held, effort.coarse)
     alive = _alive(current)
-    _first(vertices, current[alive], alive, layout, cones, weights, area)
-    relax_all(vertices, current, alive, layout, held, area, effort, effort.first)
+    ids, local = topology.renumbered(current[alive], len(vertices))
+    few, last_rounds = collapsed(vertices[ids], local[current[alive]], held[ids], effort.coarsest)
+    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in last_rounds])
+
+    small = Layout(lift[alive], np.zeros((len(ids), 2)), np.eye(2))
+    of_cones = None if cones is None else local[cones]
+    _first(vertices[ids], few, small, of_cones, weights, area)
+    _undone(vertices[ids], few, last_rounds, small, held[ids], area, effort)
+    layout = Layout(lift, np.zeros((len(vertices), 2)), small.lattice)
+    layout.uv[ids] = small.uv
+    _undone(vertices, current, rounds, layout, held, area, effort)
+    return layout
+
+
+def _renamed(step: Round, ids: np.ndarray, alive: np.ndarray) -> Round:
+    """A round of a mesh with only some vertices and faces, in the numbers of the whole."""
+    corners = 3 * alive[step.corners // 3] + step.corners % 3
+    return Round(ids[step.vertex], ids[step.target], step.before, corners, step.star)
+
+
+def _undone(
+    vertices: np.ndarray,
+    current: np.ndarray,
+    rounds: list[Round],
+    layout: Layout,
+    held: np.ndarray,
+    area: float,
+    effort: Effort,
+) -> None:
+    """Relax a coarse mesh, and put back the vertices of all rounds."""
+    alive = _alive(current)
+    relax_all(vertices, current, alive, layout, held, area, effort, effort.last)
     done = len(alive)
     for step in reversed(rounds):
         undo(current, step)
         alive = _alive(current)
-        scaled = _scaled(vertices, current[alive], area)
-        _put_back(scaled, current, layout, step)
+        _put_back(_scaled(vertices, current[alive], area), current, layout, step)
         last = step is rounds[0]
-        if last or len(alive) >= _GROWTH * done:
+        if last or len(alive) >= effort.growth * done:
             done = len(alive)
             steps = effort.last if last else effort.level
             relax_all(vertices, current, alive, layout, held, area, effort, steps)
-    return layout
 
 
 def relax_all(
@@ -154,19 +183,18 @@ def _scaled(vertices: np.ndarray, faces: np.ndarray, area: float) -> np.ndarray:
 def _first(
     vertices: np.ndarray,
     faces: np.ndarray,
-    alive: np.ndarray,
     layout: Layout,
     cones: np.ndarray | None,
     weights: str,
     area: float,
 ) -> None:
     """Tutte's embedding of the coarsest mesh."""
-    ids, local = topology.renumbered(faces, len(vertices))
-    weight = edge_weights(vertices, faces, weights)
-    of_cones = None if cones is None else local[cones]
-    x, quadratic = tutte(local[faces], layout.lift[alive], weight, of_cones)
+    alive = _alive(faces)
+    present = faces[alive]
+    weight = edge_weights(vertices, present, weights)
+    x, quadratic = tutte(present, layout.lift[alive], weight, cones)
     layout.lattice = best_lattice(quadratic, _LATTICE)
-    layout.uv[ids] = x @ layout.lattice.T
+    layout.uv[: len(x)] = x @ layout.lattice.T
 
 
 def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.ndarray:

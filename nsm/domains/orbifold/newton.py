@@ -117,7 +117,11 @@ class Quotient:
         data[self.diagonal] *= 1 + 1e-10
         matrix = csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
         slope = self._gathered(gradient)
-        direction[self.free] = -factorised(matrix).solve(slope[self.free].ravel()).reshape(-1, 2)
+        try:
+            solution = factorised(matrix).solve(slope[self.free].ravel())
+        except RuntimeError:  # singular: no step
+            return uv, self.energy(uv, lattice), 0.0
+        direction[self.free] = -solution.reshape(-1, 2)
         change = np.einsum(
             "fki,fkj->fij", self.sign[:, :, None] * direction[self.faces], self.gradients
         )
@@ -153,9 +157,11 @@ class Quotient:
             ],
             axis=1,
         )
-        by_j = (
-            2 * (1 + det**-2)[:, None, None] * j - (2 * square * det**-3)[:, None, None] * cofactor
-        )
+        with np.errstate(all="ignore"):
+            by_j = (
+                2 * (1 + det**-2)[:, None, None] * j
+                - (2 * square * det**-3)[:, None, None] * cofactor
+            )
         gradient = self.area[:, None, None] * np.einsum("fij,fkj->fki", by_j, self.gradients)
         left, large, small, right = _singular(j, det)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -1,0 +1,77 @@
+"""The last vertices of a coarse closed mesh drawn together, whatever that does to its shape.
+
+:mod:`nsm.surfaces.coarsening` keeps shapes, so it stops at some hundred triangles on a thin or
+bent mesh. What remains here is a handful: no limb is left that an embedding could squeeze.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nsm.surfaces.coarsening import Round
+
+
+def collapsed(
+    vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, count: int
+) -> tuple[np.ndarray, list[Round]]:
+    """Collapse the shortest edges of a closed mesh (V, 3), (F, 3) until ``count`` faces are left.
+
+    Args:
+        held: (V,) mask of vertices that stay.
+
+    Returns:
+        the faces, those that are gone with two equal corners, and one round for each vertex.
+    """
+    faces, rounds = faces.copy(), []
+    around: list[set[int]] = [set() for _ in range(len(vertices))]  # faces of each vertex
+    for f, corner in enumerate(faces.tolist()):
+        for v in corner:
+            around[v].add(f)
+    left = len(faces)
+
+    def neighbours(v: int) -> set[int]:
+        return {int(w) for f in around[v] for w in faces[f]} - {v}
+
+    candidates = {int(v) for v in np.unique(faces)} - set(np.flatnonzero(held).tolist())
+    best: dict[int, tuple[float, int]] = {}
+
+    def look(v: int) -> None:
+        ring = neighbours(v)
+        best.pop(v, None)
+        options = []
+        for w in ring:
+            other = neighbours(w)
+            # the link condition, and no vertex with hardly any room around it
+            common = ring & other
+            if len(common) == 2 and len(ring | other) - 2 >= 3:
+                if all(len(around[u]) > 3 for u in common):
+                    length = float(np.linalg.norm(vertices[v] - vertices[w]))
+                    # vertices of high degree are hard to place again
+                    crowd = max(len(ring) + len(other) - 4, 6) / 6
+                    options.append((length * crowd, w))
+        if options:
+            best[v] = min(options)
+
+    for v in candidates:
+        look(v)
+    while left > count and best:
+        v = min(best, key=lambda u: (best[u][0], u))
+        w = best.pop(v)[1]
+        corners = np.array([3 * f + faces[f].tolist().index(v) for f in sorted(around[v])])
+        one = np.array([v])
+        rounds.append(
+            Round(one, np.array([w]), np.array([-1]), corners, np.zeros(len(corners), dtype=int))
+        )
+        ring = neighbours(v) | neighbours(w)
+        gone = around[v] & around[w]
+        faces.ravel()[corners] = w
+        for f in gone:
+            for u in set(faces[f].tolist()):
+                around[u].discard(f)
+        around[w] |= around[v] - gone
+        around[v] = set()
+        candidates.discard(v)
+        left -= len(gone)
+        for u in ring & candidates:
+            look(u)
+    return faces, rounds
