@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linprog
 
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
@@ -24,7 +25,8 @@ AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lat
 _LATTICE = 4.0
 _STEPS = 2  # of Newton's method on what was put back
 _NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
-_TRIES = 60
+_TRIES = 6
+_LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
 
 
 @dataclass(frozen=True)
@@ -86,8 +88,14 @@ def laid_out(
     of_cones = None if cones is None else local[cones]
     _first(vertices[ids], few, small, of_cones, weights, area)
     _undone(vertices[ids], few, last_rounds, small, held[ids], area, effort)
+    # canonical coordinates near the domain have the most digits
+    gauge = group.identities(len(vertices))
+    x, gauge[ids] = group.into_domain(small.uv @ np.linalg.inv(small.lattice).T, cones is not None)
+    if cones is not None:
+        x[of_cones], gauge[cones] = group.CONES, group.IDENTITY
+    lift = group.compose(lift, group.inverse(gauge[_clusters(len(vertices), rounds)[faces]]))
     layout = Layout(lift, np.zeros((len(vertices), 2)), small.lattice)
-    layout.uv[ids] = small.uv
+    layout.uv[ids] = x @ small.lattice.T
     _undone(vertices, current, rounds, layout, held, area, effort)
     return layout
 
@@ -197,10 +205,18 @@ def _first(
     layout.uv[: len(x)] = x @ layout.lattice.T
 
 
+def _clusters(count: int, rounds: list[Round]) -> np.ndarray:
+    """The vertex (V,) that each is drawn into in the end."""
+    into = np.arange(count)
+    for step in reversed(rounds):
+        into[step.vertex] = into[step.target]
+    return into
+
+
 def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.ndarray:
     """Lifts (F, 3, 3) with canonical coordinates such that a vertex and the one that it is drawn
     into have the same lift in the triangles they share: lifts then stay as corners change names."""
-    gauge = group.identities(lift.shape[0] and int(faces.max()) + 1)
+    gauge = group.identities(int(faces.max()) + 1)
     current, into = faces.copy(), np.arange(len(gauge))
     for step in rounds:
         face, k = step.corners // 3, step.corners % 3
@@ -232,14 +248,12 @@ def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Rou
     target = uv[step.target]
     place = _mean_values(vertices, stars, b, c)
     missing = _placed(uv, stars, b, c, target, place)
-    if len(missing):
-        inwards = _inwards(stars, step, b, c, target, place)
-        keep = np.zeros(len(target), dtype=bool)
-        keep[missing] = True
-        corners = keep[stars.star]
-        left = stars.chosen(keep)
-        if len(_placed(uv, left, b[corners], c[corners], target[keep], inwards[keep])):
+    for number in missing.tolist():
+        mine = stars.star == number
+        at = _innermost(b[mine], c[mine])
+        if at is None:
             raise NsmError("a vertex finds no place without a flip", kind="not_injective")
+        uv[step.vertex[number]] = at
     for _ in range(_STEPS):
         relax(uv, lattice, stars)
 
@@ -269,23 +283,25 @@ def _placed(
     return missing
 
 
-def _inwards(
-    stars: Stars,
-    step: Round,
-    b: np.ndarray,
-    c: np.ndarray,
-    target: np.ndarray,
-    place: np.ndarray,
-) -> np.ndarray:
-    """Places (N, 2) as far from their targets as the given ones, but between the sides there."""
-    of_star = step.target[stars.star]
-    left = np.zeros_like(place)
-    for which in (stars.b == of_star, stars.c == of_star):
-        side = (c - b)[which]
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
-        np.add.at(left, stars.star[which], np.stack([-side[:, 1], side[:, 0]], axis=1))
-    length = np.linalg.norm(left, axis=1).clip(1e-300)
-    return target + (np.linalg.norm(place - target, axis=1) / length)[:, None] * left
+def _innermost(b: np.ndarray, c: np.ndarray) -> np.ndarray | None:
+    """The point (2,) of a ring of sides (K, 2) to (K, 2) that sees all of them, at the largest
+    distance from the nearest; None if there is none."""
+    middle, size = b.mean(axis=0), max(float(np.ptp(b, axis=0).max()), 1e-300)
+    b, side = (b - middle) / size, (c - b) / size
+    normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
+    length = np.linalg.norm(normal, axis=1).clip(1e-300)
+    normal /= length[:, None]
+    found = linprog(
+        [0.0, 0.0, -1.0],
+        A_ub=np.concatenate([-normal, np.ones((len(b), 1))], axis=1),
+        b_ub=-(normal * b).sum(axis=1),
+        bounds=[(None, None), (None, None), (None, None)],
+        method="highs",
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    if found.x is None or found.x[2] * size < _LEAST_ROOM:
+        return None
+    return middle + size * found.x[:2]
 
 
 def _mean_values(vertices: np.ndarray, stars: Stars, b: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -20,10 +20,13 @@ _BACKTRACKS = 12
 _DECREASE = 1e-4
 
 
-def hat_gradients(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def hat_gradients(
+    vertices: np.ndarray, faces: np.ndarray, flattest: float = 1e-3
+) -> tuple[np.ndarray, np.ndarray]:
     """Gradients (F, 3, 2) of the corners' hat functions, in a frame of each face, and areas (F,).
 
-    Triangles without area get one that is tiny: they count for next to nothing.
+    Triangles flatter than ``flattest``, height over length, get that height: nobody sees how the
+    map distorts needles, and keeping their shape would cost digits.
     """
     a, b, c = vertices[faces].transpose(1, 0, 2)
     u, v = b - a, c - a
@@ -33,7 +36,7 @@ def hat_gradients(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     along = (u * v).sum(axis=1) / lu
     double = np.linalg.norm(np.cross(u, v), axis=1)
     longest = np.maximum(lu, np.linalg.norm(v, axis=1))
-    double = np.maximum(double, 1e-6 * longest**2)
+    double = np.maximum(double, flattest * longest**2)
     up = double / lu
     # the triangle (0, 0), (lu, 0), (along, up)
     g1 = np.stack([1 / lu, -along / (lu * up)], axis=1)
@@ -164,7 +167,7 @@ class Quotient:
             )
         gradient = self.area[:, None, None] * np.einsum("fij,fkj->fki", by_j, self.gradients)
         left, large, small, right = _singular(j, det)
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             product = large * small
             values = np.stack(
                 [
@@ -249,7 +252,7 @@ def distortions(
         x: (V, 2) in coordinates of the lattice (2, 2).
     """
     corner = group.moved(lift, x[faces]) @ lattice.T
-    gradients, area = hat_gradients(vertices, faces)
+    gradients, area = hat_gradients(vertices, faces, 1e-9)
     j = np.einsum("fki,fkj->fij", corner, gradients)
     det = _det(j)
     j *= np.sqrt(area.sum() / (area * np.abs(det)).sum())
