@@ -20,9 +20,9 @@ def collapsed(
         held: (V,) mask of vertices that stay.
 
     Returns:
-        the faces, those that are gone with two equal corners, and one round for each vertex.
+        the faces, those that are gone with two equal corners, and the rounds.
     """
-    faces, rounds = faces.copy(), []
+    faces = faces.copy()
     around: list[set[int]] = [set() for _ in range(len(vertices))]  # faces of each vertex
     for f, corner in enumerate(faces.tolist()):
         for v in corner:
@@ -54,16 +54,21 @@ def collapsed(
 
     for v in candidates:
         look(v)
+    steps: list[list[tuple[int, int, list[int]]]] = []
+    last = np.zeros(len(vertices), dtype=np.int64)  # how many rounds touched a vertex or its ring
     while left > count and best:
         v = min(best, key=lambda u: (best[u][0], u))
         w = best.pop(v)[1]
-        corners = np.array([3 * f + faces[f].tolist().index(v) for f in sorted(around[v])])
-        one = np.array([v])
-        rounds.append(
-            Round(one, np.array([w]), np.array([-1]), corners, np.zeros(len(corners), dtype=int))
-        )
-        ring = neighbours(v) | neighbours(w)
+        corners = [3 * f + faces[f].tolist().index(v) for f in sorted(around[v])]
+        # into the first round after all that touched its ring
+        ring = [v, *neighbours(v)]
+        number = int(last[ring].max())
+        last[ring] = number + 1
+        if number == len(steps):
+            steps.append([])
+        steps[number].append((v, w, corners))
         gone = around[v] & around[w]
+        near = neighbours(v) | neighbours(w)
         faces.ravel()[corners] = w
         for f in gone:
             for u in set(faces[f].tolist()):
@@ -72,6 +77,18 @@ def collapsed(
         around[v] = set()
         candidates.discard(v)
         left -= len(gone)
-        for u in ring & candidates:
+        for u in near & candidates:
             look(u)
-    return faces, rounds
+    return faces, [_round(step) for step in steps]
+
+
+def _round(step: list[tuple[int, int, list[int]]]) -> Round:
+    vertex, target, corners = zip(*step, strict=True)
+    count = [len(c) for c in corners]
+    return Round(
+        np.array(vertex),
+        np.array(target),
+        np.full(len(vertex), -1),
+        np.concatenate([np.array(c) for c in corners]),
+        np.repeat(np.arange(len(vertex)), count),
+    )

@@ -25,7 +25,7 @@ AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lat
 _LATTICE = 4.0
 _STEPS = 2  # of Newton's method on what was put back
 _NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
-_TRIES = 6
+_TRIES = 12
 _LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
 
 
