@@ -52,11 +52,11 @@ def rounded(x: np.ndarray) -> np.ndarray:
 def into_domain(x: np.ndarray, symmetric: bool) -> tuple[np.ndarray, np.ndarray]:
     """Points (V, 2) moved into the fundamental domain, and the elements (V, 3) that move them.
 
-    The domain is [-½, ½) x [0, ½] if ``symmetric`` (the orbifold), else [0, 1) x [0, 1).
+    The domain is [-½, ½) x [0, ½] if ``symmetric`` (the orbifold), else [-½, ½) x [-½, ½).
     """
     g = identities(len(x))
     if not symmetric:
-        g[:, 1:] = -np.floor(x).astype(np.int64)
+        g[:, 1:] = -np.floor(x + 0.5).astype(np.int64)
         return moved(g, x), g
     g[:, 2] = -np.rint(x[:, 1]).astype(np.int64)  # second coordinate in [-½, ½]
     y = moved(g, x)

@@ -122,7 +122,7 @@ def _undone(
     for step in reversed(rounds):
         undo(current, step)
         alive = _alive(current)
-        _put_back(_scaled(vertices, current[alive], area), current, layout, step)
+        _put_back(scaled(vertices, current[alive], area), current, layout, step)
         last = step is rounds[0]
         if last or len(alive) >= effort.growth * done:
             done = len(alive)
@@ -142,13 +142,13 @@ def relax_all(
 ) -> None:
     """Lower the energy of those of the faces that are alive, by global steps or by sweeps."""
     present, lift = faces[alive], layout.lift[alive]
-    scaled = _scaled(vertices, present, area)
+    mesh = scaled(vertices, present, area)
     small = len(present) <= 2 * effort.largest
     classes: list[Stars] | None = None
-    quotient = Quotient(scaled, present, lift, held) if small else None
+    quotient = Quotient(mesh, present, lift, held) if small else None
     if quotient is None:
-        classes = list(colour_classes(scaled, present, lift, held))
-        shape = _Shape(scaled, present, lift)
+        classes = list(colour_classes(mesh, present, lift, held))
+        shape = _Shape(mesh, present, lift)
         for _ in range(effort.sweeps):
             layout.shaped(shape.best(layout))
             for stars in classes:
@@ -160,7 +160,7 @@ def relax_all(
         layout.uv, energy, size = quotient.step(layout.uv, layout.lattice)
         if size < 0.1:
             # the worst triangles hold everything up: move their vertices on their own
-            classes = classes or list(colour_classes(scaled, present, lift, held))
+            classes = classes or list(colour_classes(mesh, present, lift, held))
             for stars in classes:
                 relax(layout.uv, layout.lattice, stars)
         elif before - energy < effort.stop * energy:
@@ -184,7 +184,8 @@ def _alive(faces: np.ndarray) -> np.ndarray:
     return np.flatnonzero((a != b) & (b != c) & (c != a))
 
 
-def _scaled(vertices: np.ndarray, faces: np.ndarray, area: float) -> np.ndarray:
+def scaled(vertices: np.ndarray, faces: np.ndarray, area: float) -> np.ndarray:
+    """The vertices (V, 3) in a unit in which the faces have the given area."""
     return vertices * np.sqrt(area / topology.face_areas(vertices, faces).sum())
 
 
