@@ -152,9 +152,7 @@ def _finished(
     return embedding
 
 
-def _near_domain(
-    lift: np.ndarray, x: np.ndarray, faces: np.ndarray, symmetric: bool
-) -> np.ndarray:
+def _near_domain(lift: np.ndarray, x: np.ndarray, faces: np.ndarray, symmetric: bool) -> np.ndarray:
     """Lifts (F, 3, 3) of each triangle such that its middle lies in the domain."""
     middle = group.moved(lift, x[faces]).mean(axis=1)
     _, element = group.into_domain(middle, symmetric)
