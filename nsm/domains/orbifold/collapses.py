@@ -6,6 +6,8 @@ bent mesh. What remains here is a handful: no limb is left that an embedding cou
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from nsm.surfaces.coarsening import Round
@@ -24,31 +26,30 @@ def collapsed(
     """
     faces = faces.copy()
     around: list[set[int]] = [set() for _ in range(len(vertices))]  # faces of each vertex
+    beside: list[set[int]] = [set() for _ in range(len(vertices))]  # its neighbours
     for f, corner in enumerate(faces.tolist()):
         for v in corner:
             around[v].add(f)
+            beside[v].update(corner)
+    for v, ring in enumerate(beside):
+        ring.discard(v)
+    points = vertices.tolist()
     left = len(faces)
-
-    def neighbours(v: int) -> set[int]:
-        return {int(w) for f in around[v] for w in faces[f]} - {v}
-
     candidates = {int(v) for v in np.unique(faces)} - set(np.flatnonzero(held).tolist())
     best: dict[int, tuple[float, int]] = {}
 
     def look(v: int) -> None:
-        ring = neighbours(v)
+        ring, at = beside[v], points[v]
         best.pop(v, None)
         options = []
         for w in ring:
-            other = neighbours(w)
             # the link condition, and no vertex with hardly any room around it
-            common = ring & other
-            if len(common) == 2 and len(ring | other) - 2 >= 3:
+            common = ring & beside[w]
+            if len(common) == 2 and len(ring) + len(beside[w]) >= 7:
                 if all(len(around[u]) > 3 for u in common):
-                    length = float(np.linalg.norm(vertices[v] - vertices[w]))
                     # vertices of high degree are hard to place again
-                    crowd = max(len(ring) + len(other) - 4, 6) / 6
-                    options.append((length * crowd, w))
+                    crowd = max(len(ring) + len(beside[w]) - 4, 6) / 6
+                    options.append((math.dist(at, points[w]) * crowd, w))
         if options:
             best[v] = min(options)
 
@@ -61,20 +62,25 @@ def collapsed(
         w = best.pop(v)[1]
         corners = [3 * f + faces[f].tolist().index(v) for f in sorted(around[v])]
         # into the first round after all that touched its ring
-        ring = [v, *neighbours(v)]
+        ring = [v, *beside[v]]
         number = int(last[ring].max())
         last[ring] = number + 1
         if number == len(steps):
             steps.append([])
         steps[number].append((v, w, corners))
         gone = around[v] & around[w]
-        near = neighbours(v) | neighbours(w)
+        near = beside[v] | beside[w]
         faces.ravel()[corners] = w
         for f in gone:
             for u in set(faces[f].tolist()):
                 around[u].discard(f)
         around[w] |= around[v] - gone
-        around[v] = set()
+        for u in beside[v]:
+            beside[u].discard(v)
+            if u != w:
+                beside[u].add(w)
+                beside[w].add(u)
+        around[v], beside[v] = set(), set()
         candidates.discard(v)
         left -= len(gone)
         for u in near & candidates:

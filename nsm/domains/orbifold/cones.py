@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from nsm.domains.orbifold.lifts import cone_lifts
-from nsm.domains.orbifold.multiresolution import AREA, Effort, Layout, laid_out, scaled
+from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.surfaces import topology
 from nsm.surfaces.coarsening import coarsen, present_faces
@@ -84,15 +84,19 @@ def extremities(vertices: np.ndarray, faces: np.ndarray, count: int = _EXTREMITI
 
 
 def score(
-    vertices: np.ndarray, faces: np.ndarray, cones: np.ndarray, effort: Effort
-) -> tuple[float, Layout]:
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cones: np.ndarray,
+    effort: Effort,
+    levels: Hierarchy | None = None,
+) -> float:
     """The area-weighted mean logarithm of the distortion of a mesh laid out with given cones."""
     lift, _ = cone_lifts(vertices, faces, cones.tolist())
-    layout = laid_out(vertices, faces, lift, cones, effort=effort)
+    layout = laid_out(vertices, faces, lift, cones, effort=effort, levels=levels)
     x = layout.uv @ np.linalg.inv(layout.lattice).T
-    area = topology.face_areas(scaled(vertices, faces, AREA[True]), faces)
+    area = topology.face_areas(vertices, faces)
     value = np.log(distortions(vertices, faces, layout.lift, x, layout.lattice))
-    return float((area * value).sum() / area.sum()), layout
+    return float((area * value).sum() / area.sum())
 
 
 def choose_cones(
@@ -139,8 +143,11 @@ def _scored(
     effort: Effort,
 ) -> list[float]:
     coarse, ids = decimated(vertices, faces, count, candidates)
-    local = np.searchsorted(ids, candidates)
-    return [score(vertices[ids], coarse, local[four], effort)[0] for four in sets]
+    local, points = np.searchsorted(ids, candidates), vertices[ids]
+    held = np.zeros(len(ids), dtype=bool)
+    held[local] = True
+    levels = hierarchy(points, coarse, held, effort)
+    return [score(points, coarse, local[four], effort, levels) for four in sets]
 
 
 def _four_apart(vertices: np.ndarray, faces: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -8,9 +8,9 @@ no descent comes back from there. On a few hundred triangles it does not; each r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
-from scipy.optimize import linprog
 
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
@@ -59,13 +59,43 @@ class Layout:
         self.lattice = matrix @ self.lattice
 
 
+@dataclass(frozen=True)
+class Hierarchy:
+    """A mesh drawn together in two stages.
+
+    The first stage keeps the surface's shape: its faces (F, 3), those that are gone with two equal
+    corners; its rounds; which faces (F',) are left, and the vertices (V',) that they name. The
+    second, on these alone and in their numbers, leaves a handful of faces (F', 3), and its rounds.
+    """
+
+    faces: np.ndarray
+    rounds: list[Round]
+    alive: np.ndarray
+    ids: np.ndarray
+    few: np.ndarray
+    last_rounds: list[Round]
+
+
+def hierarchy(
+    vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, effort: Effort
+) -> Hierarchy:
+    """Draw a closed mesh (V, 3), (F, 3) together; the vertices of a mask (V,) stay."""
+    current, rounds = coarsen(vertices, faces, held, effort.coarse)
+    alive = _alive(current)
+    ids, local = topology.renumbered(current[alive], len(vertices))
+    few, last_rounds = collapsed(vertices[ids], local[current[alive]], held[ids], effort.coarsest)
+    return Hierarchy(current, rounds, alive, ids, few, last_rounds)
+
+
 def laid_out(
     vertices: np.ndarray,
     faces: np.ndarray,
     lift: np.ndarray,
     cones: np.ndarray | None,
+    *,
     weights: str = "uniform",
     effort: Effort | None = None,
+    levels: Hierarchy | None = None,
 ) -> Layout:
     """Lay a closed mesh (V, 3), (F, 3) out with little symmetric Dirichlet energy, no flips.
 
@@ -73,21 +103,26 @@ def laid_out(
         lift: (F, 3, 3); the result's may have other canonical coordinates.
         cones: (4,) vertices; None for a torus.
         weights: of the first embedding, see :func:`tutte.edge_weights`.
+        levels: if the mesh has been drawn together before, with the cones held.
+
+    Raises:
+        NsmError: a vertex finds no place without a flip, for lack of digits (``not_injective``).
     """
     effort = effort or Effort()
     held = np.zeros(len(vertices), dtype=bool)
     held[faces[0, 0] if cones is None else cones] = True
     area = AREA[cones is not None]
-    current, rounds = coarsen(vertices, faces, held, effort.coarse)
-    alive = _alive(current)
-    ids, local = topology.renumbered(current[alive], len(vertices))
-    few, last_rounds = collapsed(vertices[ids], local[current[alive]], held[ids], effort.coarsest)
-    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in last_rounds])
+    levels = levels or hierarchy(vertices, faces, held, effort)
+    ids, alive, rounds = levels.ids, levels.alive, levels.rounds
+    local = np.full(len(vertices), -1)
+    local[ids] = np.arange(len(ids))
+    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.last_rounds])
 
     small = Layout(lift[alive], np.zeros((len(ids), 2)), np.eye(2))
     of_cones = None if cones is None else local[cones]
+    few = levels.few.copy()
     _first(vertices[ids], few, small, of_cones, weights, area)
-    _undone(vertices[ids], few, last_rounds, small, held[ids], area, effort)
+    _undone(vertices[ids], few, levels.last_rounds, small, held[ids], area, effort)
     # canonical coordinates near the domain have the most digits
     gauge = group.identities(len(vertices))
     x, gauge[ids] = group.into_domain(small.uv @ np.linalg.inv(small.lattice).T, cones is not None)
@@ -96,7 +131,7 @@ def laid_out(
     lift = group.compose(lift, group.inverse(gauge[_clusters(len(vertices), rounds)[faces]]))
     layout = Layout(lift, np.zeros((len(vertices), 2)), small.lattice)
     layout.uv[ids] = x @ small.lattice.T
-    _undone(vertices, current, rounds, layout, held, area, effort)
+    _undone(vertices, levels.faces.copy(), rounds, layout, held, area, effort)
     return layout
 
 
@@ -292,17 +327,20 @@ def _innermost(b: np.ndarray, c: np.ndarray) -> np.ndarray | None:
     normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
     length = np.linalg.norm(normal, axis=1).clip(1e-300)
     normal /= length[:, None]
-    found = linprog(
-        [0.0, 0.0, -1.0],
-        A_ub=np.concatenate([-normal, np.ones((len(b), 1))], axis=1),
-        b_ub=-(normal * b).sum(axis=1),
-        bounds=[(None, None), (None, None), (None, None)],
-        method="highs",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
-    if found.x is None or found.x[2] * size < _LEAST_ROOM:
+    # n_k p - r >= h_k: the best r is met with equality by three of the sides
+    three = np.array(list(combinations(range(len(b)), 3)))
+    system = np.concatenate([normal, np.full((len(b), 1), -1.0)], axis=1)[three]
+    height = (normal * b).sum(axis=1)
+    good = np.abs(np.linalg.det(system)) > 1e-12
+    if not good.any():
         return None
-    return middle + size * found.x[:2]
+    found = np.linalg.solve(system[good], height[three[good]][:, :, None])[:, :, 0]
+    slack = (found[:, :2] @ normal.T - height - found[:, 2:]).min(axis=1)
+    radius = np.where(slack >= -1e-9 * np.abs(found[:, 2]), found[:, 2], -np.inf)
+    best = int(radius.argmax())
+    if not radius[best] * size >= _LEAST_ROOM:
+        return None
+    return middle + size * found[best, :2]
 
 
 def _mean_values(vertices: np.ndarray, stars: Stars, b: np.ndarray, c: np.ndarray) -> np.ndarray:
