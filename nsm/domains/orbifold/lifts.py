@@ -121,6 +121,9 @@ def torus_lifts(faces: np.ndarray) -> np.ndarray:
         for face, edge in to_root(first):
             leave(face, edge, number, -1)
     along = form[edges.of_corner] * runs[:, :, None]  # (F, 3, 2): corner k to k + 1
+    # the integral of the first form times the second over the surface is 1 or -1
+    if (along[:, 0, 0] * along[:, 1, 1] - along[:, 0, 1] * along[:, 1, 0]).sum() < 0:
+        along = along[:, :, ::-1]
     lift = group.identities(len(faces), 3)
     lift[:, 1, 1:] = along[:, 0]
     lift[:, 2, 1:] = along[:, 0] + along[:, 1]
