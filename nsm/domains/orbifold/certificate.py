@@ -1,4 +1,4 @@
-"""Whether a map of a closed surface to the orbifold or torus is a homeomorphism, decided exactly."""
+"""Whether a map of a closed surface to the orbifold or the torus is a homeomorphism, exactly."""
 
 from __future__ import annotations
 

@@ -62,9 +62,9 @@ def collapsed(
         w = best.pop(v)[1]
         corners = [3 * f + faces[f].tolist().index(v) for f in sorted(around[v])]
         # into the first round after all that touched its ring
-        ring = [v, *beside[v]]
-        number = int(last[ring].max())
-        last[ring] = number + 1
+        touched = [v, *beside[v]]
+        number = int(last[touched].max())
+        last[touched] = number + 1
         if number == len(steps):
             steps.append([])
         steps[number].append((v, w, corners))

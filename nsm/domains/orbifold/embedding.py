@@ -68,6 +68,7 @@ def embed_orbifold(
     faces: np.ndarray,
     cones: Sequence[int] | None = None,
     *,
+    keep_order: bool | None = None,
     effort: Effort | None = None,
 ) -> Embedding:
     """Lay a closed surface of genus 0 out on the orbifold 2222.
@@ -77,6 +78,8 @@ def embed_orbifold(
         faces: (F, 3), one closed oriented manifold component.
         cones: four vertices, in the order of (0, 0), (1, 0), (1, 1), (0, 1); chosen among the
             surface's extremities if not given.
+        keep_order: whether the cones keep their order; if not, they take the one for which the
+            lattice is least sheared. By default given cones keep it, and chosen ones do not.
         effort: how much is done.
 
     Raises:
@@ -84,7 +87,7 @@ def embed_orbifold(
             of its vertices (``wrong_cones``), or digits do not suffice (``not_injective``).
     """
     log: list[str] = []
-    given = cones is not None
+    keep_order = cones is not None if keep_order is None else keep_order
     if cones is None:
         cone_lifts(vertices, faces, np.unique(faces)[:4].tolist())  # is it a sphere at all?
         chosen, table = choose_cones(vertices, faces)
@@ -95,7 +98,7 @@ def embed_orbifold(
     layout = laid_out(vertices, faces, lift, corners, effort=effort)
     x = np.linalg.solve(layout.lattice, layout.uv.T).T
     x[corners] = group.CONES
-    return _finished(faces, layout.lift, x, layout.lattice, corners, given, log)
+    return _finished(faces, layout.lift, x, layout.lattice, corners, keep_order, log)
 
 
 def embed_torus(

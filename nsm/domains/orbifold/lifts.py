@@ -153,7 +153,7 @@ def _checked_cones(vertices: np.ndarray, faces: np.ndarray, cones: Sequence[int]
 
 
 class _Split:
-    """A mesh whose edges are split where paths need room; each face knows the face it is part of."""
+    """A mesh whose edges are split where paths need room; faces know what they are part of."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.points, self.faces, self.original = vertices, faces, faces

@@ -110,7 +110,7 @@ def _value_and_jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> tupl
     for k in range(2):
         tangent = torch.zeros_like(x)
         tangent[..., k] = 1
-        value, column = torch.func.jvp(function, (x,), (tangent,))
+        value, column = torch.func.jvp(function, (x,), (tangent,))[:2]
         columns.append(column)
     return value, torch.stack(columns, dim=-1)
 
@@ -170,7 +170,7 @@ class EvenMap(nn.Module):
             return features, jacobian
         columns = []
         for k in range(2):
-            value, column = torch.func.jvp(self.network, (features,), (jacobian[..., k],))
+            value, column = torch.func.jvp(self.network, (features,), (jacobian[..., k],))[:2]
             columns.append(column)
         return value, torch.stack(columns, dim=-1)
 

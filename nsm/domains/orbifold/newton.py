@@ -117,7 +117,7 @@ class Quotient:
         data = np.bincount(
             self.place, weights=hessian.ravel()[self.kept], minlength=self.indptr[-1]
         )
-        data[self.diagonal] *= 1 + 1e-10
+        data[self.diagonal] = data[self.diagonal] * (1 + 1e-10)
         matrix = csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
         slope = self._gathered(gradient)
         try:
