@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
+from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.coarsening import coarsen, present_faces
 
@@ -147,7 +148,13 @@ def _scored(
     held = np.zeros(len(ids), dtype=bool)
     held[local] = True
     levels = hierarchy(points, coarse, held, effort)
-    return [score(points, coarse, local[four], effort, levels) for four in sets]
+    scores = []
+    for four in sets:
+        try:
+            scores.append(score(points, coarse, local[four], effort, levels))
+        except NsmError:  # squeezed below what digits hold
+            scores.append(np.inf)
+    return scores
 
 
 def _four_apart(vertices: np.ndarray, faces: np.ndarray, found: np.ndarray) -> np.ndarray:

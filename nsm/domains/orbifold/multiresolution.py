@@ -25,7 +25,8 @@ AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lat
 _LATTICE = 4.0
 _STEPS = 2  # of Newton's method on what was put back
 _NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
-_TRIES = 12
+_TRIES = 3
+_WORST = 1e3  # times the mean: a triangle of so much energy is moved on its own
 _LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
 
 
@@ -189,16 +190,21 @@ def relax_all(
             for stars in classes:
                 relax(layout.uv, layout.lattice, stars)
         return
-    before = np.inf
+    before, stuck = np.inf, True
     for _ in range(steps):
+        if stuck:
+            # the worst triangles hold global steps up: move their vertices on their own
+            classes = classes or list(colour_classes(mesh, present, lift, held))
+            for _ in range(effort.sweeps):
+                for stars in classes:
+                    relax(layout.uv, layout.lattice, stars)
+                energy, worst = quotient.spread(layout.uv, layout.lattice)
+                if worst < _WORST * energy:
+                    break
         layout.shaped(quotient.best_shape(layout.uv, layout.lattice))
         layout.uv, energy, size = quotient.step(layout.uv, layout.lattice)
-        if size < 0.1:
-            # the worst triangles hold everything up: move their vertices on their own
-            classes = classes or list(colour_classes(mesh, present, lift, held))
-            for stars in classes:
-                relax(layout.uv, layout.lattice, stars)
-        elif before - energy < effort.stop * energy:
+        stuck = size < 0.1
+        if not stuck and before - energy < effort.stop * energy:
             break
         before = energy
 

@@ -15,6 +15,7 @@ from nsm.domains.orbifold import group
 from nsm.domains.orbifold.tutte import factorised
 
 _STIFFEST = 1e8  # eigenvalues of second derivatives are kept below this
+_FLAT = 1e-3
 _BEFORE_FLIP = 0.9
 _BACKTRACKS = 12
 _DECREASE = 1e-4
@@ -31,7 +32,7 @@ def hat_gradients(
     a, b, c = vertices[faces].transpose(1, 0, 2)
     u, v = b - a, c - a
     lu = np.linalg.norm(u, axis=1)
-    mean = max(float(lu.mean()), 1e-300)
+    mean = max(float(lu.sum()) / max(len(lu), 1), 1e-300)
     lu = np.maximum(lu, 1e-9 * mean)
     along = (u * v).sum(axis=1) / lu
     double = np.linalg.norm(np.cross(u, v), axis=1)
@@ -97,12 +98,23 @@ class Quotient:
         with np.errstate(over="ignore"):
             return float((self.area * (j**2).sum(axis=(1, 2)) * (1 + det**-2)).sum())
 
+    def spread(self, uv: np.ndarray, lattice: np.ndarray) -> tuple[float, float]:
+        """Mean and largest energy of the triangles, per area; infinite if one has none."""
+        j = self.jacobians(uv, lattice)
+        det = _det(j)
+        if not (det > 0).all():
+            return np.inf, np.inf
+        value = (j**2).sum(axis=(1, 2)) * (1 + det**-2)
+        return float(self.area @ value / self.area.sum()), float(value.max())
+
     def best_shape(self, uv: np.ndarray, lattice: np.ndarray) -> np.ndarray:
         """The matrix (2, 2), symmetric with determinant 1, that lowers the energy most if it is
         applied to the plane: tr(A²C) + tr(A⁻²D) is least at A² = √|M| M⁻¹, M = C + adj D."""
         j = self.jacobians(uv, lattice)
         det = _det(j)
+        # a few triangles that are nearly flat, for want of relaxation, do not decide
         c = np.einsum("f,fij,fkj->ik", self.area, j, j)
+        det = np.maximum(det, _FLAT * c.trace() / self.area.sum())
         # adj of Σ A J⁻ᵀ J⁻¹ = Σ A JJᵀ / det², up to a turn by a right angle in both
         m = c + np.einsum("f,fij,fkj->ik", self.area / det**2, j, j)
         value, vector = np.linalg.eigh(m)
