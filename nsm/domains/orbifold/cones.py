@@ -17,10 +17,10 @@ from nsm.surfaces.coarsening import coarsen, present_faces
 
 _FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
 _FEW = 400  # of the mesh on which all candidates are compared
-_EXTREMITIES = 7
+_EXTREMITIES = 6
 _CLOSE = 0.12  # of the largest distance: two extremities nearer than this are one
 _SOURCES = 96
-_FINALISTS = 3
+_FINALISTS = 2
 _QUICK = Effort(coarse=_FEW, level=3, last=6, stop=1e-3)
 _LONGER = Effort(level=3, last=8, stop=1e-3)
 
