@@ -16,6 +16,7 @@ from nsm.surfaces import topology
 from nsm.surfaces.coarsening import coarsen, present_faces
 
 _FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
+_LARGE = 40_000
 _FEW = 400  # of the mesh on which all candidates are compared
 _EXTREMITIES = 6
 _CLOSE = 0.12  # of the largest distance: two extremities nearer than this are one
@@ -117,6 +118,12 @@ def choose_cones(
     Returns:
         the cones (4,), and all scores, best first: mean logarithm of the distortion, and cones.
     """
+    if len(faces) > _LARGE:
+        # everything below draws the mesh together anew: start from less
+        coarse, ids = decimated(vertices, faces, _LARGE // 2, candidates)
+        local = None if candidates is None else np.searchsorted(ids, candidates)
+        cones, table = choose_cones(vertices[ids], coarse, local)
+        return ids[cones], [(s, tuple(ids[list(four)].tolist())) for s, four in table]
     if candidates is None:
         candidates = extremities(vertices, faces)
         if len(candidates) < 4:

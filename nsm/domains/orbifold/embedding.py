@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -124,10 +125,10 @@ def _finished(
     keep_order: bool,
     log: list[str],
 ) -> Embedding:
-    """In a reduced basis of the lattice, canonical coordinates in the domain, and checked."""
+    """In a reduced basis of the lattice."""
     basis = reduced_basis(lattice, even=cones is not None and keep_order)
     inverse = np.rint(np.linalg.inv(basis)).astype(np.int64)
-    lattice, x = upright(lattice @ basis), x @ inverse.T
+    lattice, x = lattice @ basis, x @ inverse.T
     lift = np.concatenate([lift[:, :, :1], lift[:, :, 1:] @ inverse.T], axis=2)
     if cones is not None:
         # in another basis another cone is the second
@@ -135,6 +136,18 @@ def _finished(
         wanted = np.rint(2 * group.CONES).astype(np.int64)
         order = [int(np.flatnonzero((place == w).all(axis=1))[0]) for w in wanted]
         cones = cones[order]
+    return _canonical(faces, lift, x, lattice, cones, tuple(log))
+
+
+def _canonical(
+    faces: np.ndarray,
+    lift: np.ndarray,
+    x: np.ndarray,
+    lattice: np.ndarray,
+    cones: np.ndarray | None,
+    log: tuple[str, ...],
+) -> Embedding:
+    """With canonical coordinates in the domain, rounded, and checked."""
     x = group.rounded(x)
     x, gauge = group.into_domain(x, cones is not None)
     if cones is not None:
@@ -145,7 +158,7 @@ def _finished(
         x[cones] = group.CONES
     lift = group.compose(lift, group.inverse(gauge[faces]))
     lift = _near_domain(lift, x, faces, cones is not None)
-    embedding = Embedding(faces, SIDE * x, lift, lattice, cones, tuple(log))
+    embedding = Embedding(faces, SIDE * x, lift, upright(lattice), cones, log)
     found = embedding.certificate()
     if not found.injective:
         raise NsmError(
@@ -153,6 +166,72 @@ def _finished(
             kind="not_injective",
         )
     return embedding
+
+
+def in_order(embedding: Embedding, cones: Sequence[int]) -> Embedding:
+    """The same layout with its cones in another order: (0, 0), (1, 0), (1, 1), (0, 1).
+
+    All 24 orders are there without another solve: an affine map of the lattice, x to B (x - c) with
+    B in SL(2, Z) and c the first cone, takes one to the other. Of the matrices that do, the one is
+    taken that leaves the lattice least sheared.
+
+    Args:
+        embedding: on an orbifold.
+        cones: the embedding's four cones in the wanted order.
+
+    Raises:
+        NsmError: ``wrong_cones`` if they are not the embedding's.
+    """
+    if embedding.cones is None or sorted(cones) != sorted(embedding.cones.tolist()):
+        raise NsmError("not the embedding's four cones", kind="wrong_cones", key="cones")
+    corners = np.asarray(cones, dtype=np.int64)
+    x = embedding.uv / SIDE
+    origin = x[corners[0]]
+    first, last = (np.mod(np.rint(2 * (x[corners[k]] - origin)).astype(int), 2) for k in (1, 3))
+    basis = _with_columns(first, last)
+    inverse = np.rint(np.linalg.inv(basis)).astype(np.int64)
+    turns = np.rint((embedding.lift[:, :, :1] - 1) * origin).astype(np.int64)
+    shift = (embedding.lift[:, :, 1:] + turns) @ inverse.T
+    lift = np.concatenate([embedding.lift[:, :, :1], shift], axis=2)
+    lattice = embedding.lattice @ basis
+    return _finished(
+        embedding.faces, lift, (x - origin) @ inverse.T, lattice, corners, True, [*embedding.log]
+    )
+
+
+def twisted(embedding: Embedding, basis: np.ndarray) -> Embedding:
+    """The same layout in another basis of the lattice: another isotopy class of maps to it.
+
+    Args:
+        embedding: whatever domain.
+        basis: (2, 2) integers with determinant 1, the new basis in coordinates of the old; on an
+            orbifold the identity modulo 2, so that the cones stay. ((1, 2), (0, 1)) and
+            ((1, 0), (2, 1)) generate these, up to sign: Dehn twists around two cones.
+
+    Raises:
+        NsmError: ``out_of_range`` for other matrices.
+    """
+    basis = np.asarray(basis, dtype=np.int64)
+    even = embedding.cones is not None
+    if round(np.linalg.det(basis)) != 1 or (even and (np.mod(basis, 2) != np.eye(2)).any()):
+        raise NsmError("not a change of basis that keeps the cones", kind="out_of_range")
+    inverse = np.rint(np.linalg.inv(basis)).astype(np.int64)
+    lift = embedding.lift.copy()
+    lift[:, :, 1:] = lift[:, :, 1:] @ inverse.T
+    x = embedding.uv / SIDE @ inverse.T
+    lattice = embedding.lattice @ basis
+    return _canonical(embedding.faces, lift, x, lattice, embedding.cones, embedding.log)
+
+
+def _with_columns(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """A matrix (2, 2) of small integers with determinant 1 and the given columns modulo 2."""
+    for entries in product((-1, 0, 1), repeat=4):
+        matrix = np.array(entries).reshape(2, 2)
+        if matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0] != 1:
+            continue
+        if (np.mod(matrix, 2) == np.stack([first, last], axis=1)).all():
+            return matrix
+    raise AssertionError("two cones coincide")
 
 
 def _near_domain(lift: np.ndarray, x: np.ndarray, faces: np.ndarray, symmetric: bool) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from domains.orbifold.shapes import limbs, torus
@@ -13,7 +15,9 @@ from nsm.domains.orbifold.embedding import (
     Embedding,
     embed_orbifold,
     embed_torus,
+    in_order,
     reduced_basis,
+    twisted,
 )
 from nsm.errors import NsmError
 
@@ -71,6 +75,38 @@ def test_the_tips_are_found_and_chosen() -> None:
     embedding = embed_orbifold(vertices, faces)
     assert embedding.cones is not None and set(embedding.cones.tolist()) == set(cones.tolist())
     assert embedding.certificate().injective and embedding.log
+
+
+def test_all_orders_of_the_cones_without_another_solve(
+    embedded: tuple[np.ndarray, Embedding, list[int]],
+) -> None:
+    vertices, embedding, tips = embedded
+    before = np.sort(embedding.distortions(vertices))
+    for order in permutations(tips):
+        other = in_order(embedding, order)  # raises unless it is a homeomorphism
+        np.testing.assert_array_equal(other.uv[list(order)], [[0, 0], [1, 0], [1, 1], [0, 1]])
+        np.testing.assert_allclose(np.sort(other.distortions(vertices)), before, rtol=1e-6)
+    with pytest.raises(NsmError) as error:
+        in_order(embedding, [*tips[:3], 0])
+    assert error.value.kind == "wrong_cones"
+
+
+def test_twists_are_other_classes(embedded: tuple[np.ndarray, Embedding, list[int]]) -> None:
+    vertices, embedding, tips = embedded
+    for basis in ([[1, 2], [0, 1]], [[1, 0], [-2, 1]], [[5, 2], [2, 1]]):
+        other = twisted(embedding, np.array(basis))
+        assert other.certificate().injective
+        np.testing.assert_array_equal(other.uv[tips], embedding.uv[tips])
+        np.testing.assert_allclose(
+            np.median(other.distortions(vertices)),
+            np.median(embedding.distortions(vertices)),
+            rtol=1e-6,
+        )
+        back = twisted(other, np.rint(np.linalg.inv(basis)).astype(int))
+        np.testing.assert_allclose(back.lattice, embedding.lattice, atol=1e-9)
+    with pytest.raises(NsmError) as error:
+        twisted(embedding, np.array([[1, 1], [0, 1]]))
+    assert error.value.kind == "out_of_range"
 
 
 def test_what_is_broken_is_noticed(embedded: tuple[np.ndarray, Embedding, list[int]]) -> None:
