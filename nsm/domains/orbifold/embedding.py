@@ -43,19 +43,33 @@ class Embedding:
     cones: np.ndarray | None
     log: tuple[str, ...]
 
-    def corners(self, uv: np.ndarray | None = None) -> np.ndarray:
+    def lifts(self, matrix: np.ndarray | None = None) -> np.ndarray:
+        """The lifts (F, 3, 3), or those of images under a map h with h(x + 2k) = h(x) + 2 A k.
+
+        Args:
+            matrix: A (2, 2), integers with determinant 1: the isotopy class of h; the identity
+                if not given.
+        """
+        if matrix is None:
+            return self.lift
+        shift = self.lift[:, :, 1:] @ np.asarray(matrix, dtype=np.int64).T
+        return np.concatenate([self.lift[:, :, :1], shift], axis=2)
+
+    def corners(self, uv: np.ndarray | None = None, matrix: np.ndarray | None = None) -> np.ndarray:
         """Places (F, 3, 2) of the triangles' corners, each triangle in one piece.
 
-        Of other coordinates (V, 2) of the vertices, such as their images under an equivariant map,
-        if given.
+        Of images (V, 2) of the vertices under an equivariant map of class ``matrix``, if given.
         """
-        points = self.uv if uv is None else uv
-        return self.lift[:, :, :1] * points[self.faces] + SIDE * self.lift[:, :, 1:]
+        points, lift = self.uv if uv is None else uv, self.lifts(matrix)
+        return lift[:, :, :1] * points[self.faces] + SIDE * lift[:, :, 1:]
 
-    def certificate(self, uv: np.ndarray | None = None) -> Certificate:
-        """Exact check of the embedding, or of images (V, 2) of its vertices."""
+    def certificate(
+        self, uv: np.ndarray | None = None, matrix: np.ndarray | None = None
+    ) -> Certificate:
+        """Exact check of the embedding, or of images (V, 2) of its vertices under an equivariant
+        map of class ``matrix``."""
         points = self.uv if uv is None else uv
-        return certificate(self.faces, self.lift, points / SIDE, self.cones)
+        return certificate(self.faces, self.lifts(matrix), points / SIDE, self.cones)
 
     def distortions(self, vertices: np.ndarray, epsilon: float = 0.01) -> np.ndarray:
         """Symmetric Dirichlet energy (F,) of the map from (V, 3) to the plane of the lattice."""
