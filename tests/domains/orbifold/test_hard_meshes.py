@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from nsm.domains.orbifold.embedding import embed_orbifold
 from nsm.surfaces.loading import load_mesh
 
