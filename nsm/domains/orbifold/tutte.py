@@ -70,10 +70,13 @@ def tutte(
 
 def factorised(matrix: csc_matrix):  # type: ignore[no-untyped-def]
     """A factorisation of a symmetric positive definite matrix, ordered for its symmetry."""
+    # supernodes are not enlarged: on meshes that costs more than it saves
     return splu(
         matrix,
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
+        relax=1,
+        panel_size=4,
         options={"SymmetricMode": True},
     )
 
