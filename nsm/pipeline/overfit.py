@@ -35,6 +35,7 @@ class OverfitTask(Task):
 
     module, data, result, defaults = Overfit, SurfaceData, NeuralSurface, "overfit"
     table = staticmethod(metrics_table)
+    closed_domains = True
     start: Overfit | None = None
 
     def prepare(self, given: Given) -> None:
@@ -48,7 +49,10 @@ class OverfitTask(Task):
 
     def build(self) -> Any:
         surface = self.surface
-        module = self.module(**self.shared_settings(), diagonal=surface.bounding_box_diagonal)
+        settings = self.shared_settings()
+        settings["encoding"] = self.domain.encoding(settings["encoding"], surface.lattice)
+        module = self.module(**settings, diagonal=surface.bounding_box_diagonal)
+        module.map = self.domain.symmetric(module.map)
         if self.start is not None:
             module.load_state_dict(self.start.state_dict())
         elif self.config.map.get("linear_skip") == "fitted":
@@ -66,7 +70,11 @@ class OverfitTask(Task):
 
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
         vertices, faces, uv = result.to_mesh()
-        export_mesh(folder / "reconstruction.obj", vertices, faces, uv)
-        export_mesh(folder / "reconstruction.glb", vertices, faces, uv, texture=checkerboard())
+        corners = None
+        if not result.surface.domain.has_boundary:
+            uv, corners = result.surface.uv, result.surface.faces
+        mesh = (vertices, faces, uv)
+        export_mesh(folder / "reconstruction.obj", *mesh, uv_faces=corners)
+        export_mesh(folder / "reconstruction.glb", *mesh, uv_faces=corners, texture=checkerboard())
         error_picture(folder / "error.png", result.surface, result)
         checkerboard_picture(folder / "checkerboard.png", result.surface, result)

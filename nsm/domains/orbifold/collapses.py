@@ -1,6 +1,6 @@
 """The last vertices of a coarse closed mesh drawn together, whatever that does to its shape.
 
-:mod:`nsm.surfaces.coarsening` keeps shapes, so it stops at some hundred triangles on a thin or
+:mod:`nsm.domains.decimation` keeps shapes, so it stops at some hundred triangles on a thin or
 bent mesh. What remains here is a handful: no limb is left that an embedding could squeeze.
 """
 
@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from nsm.surfaces.coarsening import Round
+from nsm.domains.decimation import Round
 
 
 def collapsed(

@@ -8,12 +8,12 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from nsm.domains.decimation import coarsen, present_faces
 from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.coarsening import coarsen, present_faces
 
 _FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
 _LARGE = 40_000

@@ -34,11 +34,9 @@ def lifted_near(
     return best
 
 
-def triangles_over_domain(embedding: Embedding) -> tuple[np.ndarray, np.ndarray]:
-    """All lifts of triangles that meet the fundamental domain: corners (K, 3, 2), faces (K,)."""
-    symmetric = embedding.cones is not None
+def triangles_over_domain(corners: np.ndarray, symmetric: bool) -> tuple[np.ndarray, np.ndarray]:
+    """All lifts of triangles (F, 3, 2) that meet the fundamental domain: (K, 3, 2), faces (K,)."""
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
-    corners = embedding.corners()
     parts, numbers = [], []
     for sign, m, n in product((1, -1) if symmetric else (1,), (-1, 0, 1), (-1, 0, 1)):
         moved = sign * corners + SIDE * np.array([m, n])
@@ -50,8 +48,13 @@ def triangles_over_domain(embedding: Embedding) -> tuple[np.ndarray, np.ndarray]
 
 def located(embedding: Embedding, points: np.ndarray) -> Places:
     """Where points (N, 2) of Ω, in any lift, lie on the mesh: faces and barycentric weights."""
-    x, _ = group.into_domain(points / SIDE, embedding.cones is not None)
-    corners, number = triangles_over_domain(embedding)
+    return located_on(embedding.corners(), points, embedding.cones is not None)
+
+
+def located_on(corners: np.ndarray, points: np.ndarray, symmetric: bool) -> Places:
+    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift near the domain."""
+    x, _ = group.into_domain(points / SIDE, symmetric)
+    corners, number = triangles_over_domain(corners, symmetric)
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     found = locate(SIDE * x, corners.reshape(-1, 2), faces)
     return Places(number[found.face], found.weights)

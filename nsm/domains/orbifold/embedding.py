@@ -63,6 +63,34 @@ class Embedding:
         points, lift = self.uv if uv is None else uv, self.lifts(matrix)
         return lift[:, :, :1] * points[self.faces] + SIDE * lift[:, :, 1:]
 
+    def copies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The mesh with a copy of a vertex for each of its lifts that a triangle has a corner at.
+
+        Returns:
+            of each copy the vertex (C,) and its place (C, 2), one copy of every vertex first, in
+            the vertices' order; and the faces (F, 3), whose triangles lie at :meth:`corners`.
+        """
+        element = self.lift.copy()
+        if self.cones is not None:
+            # at a cone, a lift and the one after its half-turn are one place
+            x = np.zeros((len(self.uv), 2), dtype=np.int64)
+            x[self.cones] = np.rint(self.uv[self.cones]).astype(np.int64)  # twice the lattice's
+            turned = np.isin(self.faces, self.cones) & (element[..., 0] < 0)
+            element[turned, 1:] -= x[self.faces[turned]]
+            element[turned, 0] = 1
+        reach = 2 * int(np.abs(element[..., 1:]).max()) + 1
+        s, m, n = np.moveaxis(element, -1, 0)
+        code = ((s < 0) * reach + np.abs(m) * 2 + (m < 0)) * reach + np.abs(n) * 2 + (n < 0)
+        number = self.faces * (2 * reach * reach) + code  # the identity is the least of a vertex
+        _, at, copy = np.unique(number, return_index=True, return_inverse=True)
+        vertex = self.faces.ravel()[at]
+        is_first = np.diff(vertex, prepend=-1) != 0
+        order = np.argsort(~is_first, kind="stable")
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order))
+        uv = self.corners().reshape(-1, 2)[at[order]]
+        return vertex[order], uv, place[copy.reshape(self.faces.shape)]
+
     def certificate(
         self, uv: np.ndarray | None = None, matrix: np.ndarray | None = None
     ) -> Certificate:

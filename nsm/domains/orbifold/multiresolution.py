@@ -2,7 +2,7 @@
 
 On the full mesh Tutte's embedding squeezes limbs to nothing, exponentially in their length, and
 no descent comes back from there. On a few hundred triangles it does not; each round of
-:mod:`nsm.surfaces.coarsening` is then undone without a flip, and relaxed.
+:mod:`nsm.domains.decimation` is then undone without a flip, and relaxed.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
+from nsm.domains.decimation import Round, coarsen, undo
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
 from nsm.domains.orbifold.newton import Quotient
@@ -19,7 +20,6 @@ from nsm.domains.orbifold.sweeps import Stars, colour_classes, relax
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.coarsening import Round, coarsen, undo
 
 AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lattice has 4
 _LATTICE = 4.0

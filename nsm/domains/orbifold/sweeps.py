@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from nsm.domains.decimation import Rings
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.newton import hat_gradients
 from nsm.surfaces import topology
-from nsm.surfaces.coarsening import Rings
 
 _TRIES, _SHORTER = 4, 0.35
 _COLOURS = 64

@@ -53,7 +53,7 @@ def test_points_are_located(embedding: Embedding) -> None:
 
 
 def test_lifts_cover_the_domain(embedding: Embedding) -> None:
-    corners, _ = triangles_over_domain(embedding)
+    corners, _ = triangles_over_domain(embedding.corners(), embedding.cones is not None)
     b, c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]).sum()
     assert area >= (2 if embedding.cones is not None else 4)
