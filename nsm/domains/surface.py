@@ -291,7 +291,7 @@ class Surface:
             "median_symmetric_dirichlet": float(np.median(flat.distortions(centred))),
             "seconds": time.perf_counter() - start,
         }
-        chosen = ()
+        chosen: tuple[str, ...] = ()
         if flat.cones is not None:
             chosen = (f"cones at vertices {mesh.source_vertex[flat.cones].tolist()}",)
         again = np.flatnonzero(first[origin] != np.arange(len(origin)))

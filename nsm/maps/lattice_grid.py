@@ -37,6 +37,7 @@ class LatticeSplineGrid(SplineGrid):
     ) -> None:
         nn.Module.__init__(self)
         cells = [[int(n) for n in level] for level in resolutions]
+        self._cells = cells
         if not cells or any(len(c) != 2 or min(c) < 4 or c[1] % 2 for c in cells):
             raise ValueError("encoding.resolutions needs pairs of 4 cells or more, the second even")
         if features < 1:
@@ -49,6 +50,11 @@ class LatticeSplineGrid(SplineGrid):
             for n, m in cells
         )
         self.out_dim = features * len(cells)
+
+    def cells(self, level: int) -> tuple[int, int]:
+        """Cells (N₁, N₂) of a level along the two axes."""
+        n, m = self._cells[level]
+        return n, m
 
     def rows_of(self, i: Tensor, j: Tensor, cells: Tensor) -> Tensor:
         """Rows (...) of a table for coefficients (i, j), any integers (...), of a grid of cells
@@ -64,7 +70,7 @@ class LatticeSplineGrid(SplineGrid):
 
     def cell_rows(self, level: int) -> Tensor:
         """Rows (rows, 9) that the points of each cell of Ω see; the cell of row r is number r."""
-        n, m = self.resolutions[level]  # type: ignore[misc]
+        n, m = self.cells(level)
         i, j = torch.meshgrid(
             torch.arange(n), torch.arange(m // 2 if self.even else 0, m), indexing="ij"
         )

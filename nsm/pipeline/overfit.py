@@ -21,6 +21,7 @@ from nsm.results import (
     overfit_metrics,
     reconstruction_image,
 )
+from nsm.results.textures import checkerboard_at
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 
@@ -70,11 +71,12 @@ class OverfitTask(Task):
 
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
         vertices, faces, uv = result.to_mesh()
-        corners = None
-        if not result.surface.domain.has_boundary:
-            uv, corners = result.surface.uv, result.surface.faces
-        mesh = (vertices, faces, uv)
-        export_mesh(folder / "reconstruction.obj", *mesh, uv_faces=corners)
-        export_mesh(folder / "reconstruction.glb", *mesh, uv_faces=corners, texture=checkerboard())
+        obj, glb = folder / "reconstruction.obj", folder / "reconstruction.glb"
+        if result.surface.domain.has_boundary:
+            export_mesh(obj, vertices, faces, uv)
+            export_mesh(glb, vertices, faces, uv, texture=checkerboard())
+        else:
+            export_mesh(obj, vertices, faces, None)
+            export_mesh(glb, vertices, faces, None, colours=checkerboard_at(uv))
         error_picture(folder / "error.png", result.surface, result)
         checkerboard_picture(folder / "checkerboard.png", result.surface, result)

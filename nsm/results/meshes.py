@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -12,43 +12,30 @@ from PIL import Image
 from nsm.errors import NsmError
 from nsm.results.files import atomic_write
 
-if TYPE_CHECKING:
-    import trimesh
-
 
 def export_mesh(
     path: str | Path,
     vertices: np.ndarray,
     faces: np.ndarray,
-    uv: np.ndarray,
+    uv: np.ndarray | None,
     *,
     texture: Image.Image | None = None,
-    uv_faces: np.ndarray | None = None,
+    colours: np.ndarray | None = None,
 ) -> None:
     """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
 
+    A closed surface without a seam has no coordinates that are continuous on it: it goes without
+    (None), and a GLB file may have colours (V, 3) in [0, 1] at the vertices instead of a texture.
     Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file contains the
     texture; beside an OBJ file go a material file and a PNG.
-
-    Args:
-        path: of the file.
-        vertices, faces, uv: the mesh.
-        texture: a picture on it.
-        uv_faces: (F, 3) rows of uv for the corners of the faces, where a vertex has several. A GLB
-            file cannot have them: its vertices get the texture's colours.
 
     Raises:
         NsmError: ``unknown_format``: the file's ending is neither .obj nor .glb.
     """
     target = Path(path)
-    coordinates = 0.5 * (np.asarray(uv) + 1)
-    uv_faces = faces if uv_faces is None else uv_faces
+    coordinates = None if uv is None else 0.5 * (np.asarray(uv) + 1)
     if target.suffix.lower() == ".glb":
-        if uv_faces is faces:
-            data = _glb(vertices, faces, coordinates, texture)
-        else:
-            data = _coloured_glb(vertices, faces, coordinates, uv_faces, texture)
-        atomic_write(target, data)
+        atomic_write(target, _glb(vertices, faces, coordinates, texture, colours))
         return
     if target.suffix.lower() != ".obj":
         message = f"{target}: meshes are written as .obj or .glb"
@@ -65,46 +52,30 @@ def export_mesh(
         head = f"mtllib {target.stem}.mtl\nusemtl surface\n"
     lines = [head]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices.tolist()]
-    lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
-    lines += [
-        f"f {a}/{s} {b}/{t} {c}/{u}\n"
-        for (a, b, c), (s, t, u) in zip((faces + 1).tolist(), (uv_faces + 1).tolist(), strict=True)
-    ]
+    if coordinates is None:
+        lines += [f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist()]
+    else:
+        lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
+        lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
     atomic_write(target, "".join(lines).encode())
 
 
 def _glb(
-    vertices: np.ndarray, faces: np.ndarray, coordinates: np.ndarray, texture: Image.Image | None
-) -> bytes:
-    import trimesh
-
-    visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
-    return _exported(trimesh.Trimesh(vertices, faces, visual=visual, process=False))
-
-
-def _coloured_glb(
     vertices: np.ndarray,
     faces: np.ndarray,
-    coordinates: np.ndarray,
-    uv_faces: np.ndarray,
+    coordinates: np.ndarray | None,
     texture: Image.Image | None,
+    colours: np.ndarray | None,
 ) -> bytes:
     import trimesh
 
-    colours = None
-    if texture is not None:
-        at = np.zeros((len(vertices), 2))
-        at[faces] = coordinates[uv_faces]
-        pixels = np.asarray(texture.convert("RGB"))
-        size = np.array(pixels.shape[1::-1])
-        column, row = (np.mod(at * (1, -1), 1.0) * size).astype(np.int64).clip(0, size - 1).T
-        colours = pixels[row, column]
-    return _exported(trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False))
-
-
-def _exported(mesh: trimesh.Trimesh) -> bytes:
-    import trimesh
-
+    visual: Any = None
+    if coordinates is not None:
+        visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
+    elif colours is not None:
+        # as bytes: trimesh would take other numbers for what they are
+        visual = trimesh.visual.ColorVisuals(vertex_colors=np.rint(255 * colours).astype(np.uint8))
+    mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
     data = trimesh.Scene(mesh).export(file_type="glb")
     assert isinstance(data, bytes)
     return data

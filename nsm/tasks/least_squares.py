@@ -203,7 +203,7 @@ def _on_lattice(
         [np.bincount(seen.ravel(), of_target[:, :, k].ravel(), size) for k in range(columns)],
         axis=1,
     )
-    n, m = grid.resolutions[level]  # type: ignore[misc]
+    n, m = grid.cells(level)
     bends = []
     for count in (n, m):
         shift = identity(count, format="csr")[np.roll(np.arange(count), 1)]

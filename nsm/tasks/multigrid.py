@@ -106,7 +106,7 @@ def refinements(cells: int, degree: int) -> list[csr_matrix]:
 
 def lattice_refinements(grid: LatticeSplineGrid, level: int) -> list[csr_matrix]:
     """As :func:`refinements`, of a level of a grid on a closed domain."""
-    n, m = grid.resolutions[level]  # type: ignore[misc]
+    n, m = grid.cells(level)
     ups = []
     while n * m > _DIRECT**2 and n % 2 == 0 and m % 4 == 0:
         n, m = n // 2, m // 2

@@ -111,8 +111,7 @@ class ClosedDomain(Domain):
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Mask (...) of the points (..., 2) of the fundamental domain."""
-        inside: np.ndarray = ((points >= self.low) & (points <= 1.0)).all(axis=-1)
-        return inside
+        return np.asarray(((points >= self.low) & (points <= 1.0)).all(axis=-1))
 
     def locate(self, points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Places:
         """The places of points (N, 2), in any lift, on a mesh laid out over Ω."""
