@@ -7,11 +7,15 @@ import pytest
 import torch
 import trimesh
 from domains.orbifold.shapes import limbs, torus
+from rich.console import Console
 
 import nsm
+from nsm.config import compose_config
 from nsm.domains import Orbifold, Surface, Torus, domain, stored
 from nsm.errors import NsmError
 from nsm.maps import LatticeSplineGrid, NeuralMap, SplineGrid, build_network, build_stored
+from nsm.pipeline import Given, make_task, run_task
+from nsm.results.callbacks import AtomicCheckpoint
 from nsm.results.metrics import overfit_metrics, pointwise_metrics, seam_gap
 from nsm.surfaces import shapes
 from nsm.tasks.least_squares import fit_linear_skip
@@ -273,20 +277,11 @@ def test_what_cannot_be_laid_out_is_refused(mesh, settings, kind, key):
 def test_other_tasks_name_the_domain(sphere_like):
     for words in (["task=param", "phi.path=nowhere"], ["task=pair_map", "source=sphere"]):
         with pytest.raises(NsmError) as error:
-            _task([*words, "domain=orbifold"])
+            make_task(compose_config([*words, "domain=orbifold"]), Console())
         assert (error.value.kind, error.value.key) == ("wrong_domain", "domain")
     with pytest.raises(NsmError) as error:
         nsm.overfit(sphere_like, progress=False, encoding="fourier")
     assert (error.value.kind, error.value.key) == ("wrong_domain", "encoding")
-
-
-def _task(words):
-    from rich.console import Console
-
-    from nsm.config import compose_config
-    from nsm.pipeline import make_task
-
-    return make_task(compose_config(words), Console())
 
 
 # ---------------------------------------------------------------- φ
@@ -329,6 +324,26 @@ def test_from_mesh_to_files_and_back(surface, tmp_path):
     assert np.linalg.norm(phi.in_original_units(points) - given, axis=1).mean() < 0.03
     kept = build_stored(phi.map.config)
     assert kept.encoding.resolutions == phi.map.encoding.resolutions
+
+
+def test_an_interrupted_training_is_resumed(torus_like, tmp_path, monkeypatch):
+    words = ["domain=torus", "encoding.resolutions=[8]", "logger=none", "artefacts=false"]
+    words += ["trainer.max_steps=8", "data.steps_per_epoch=4", "data.batch_size=64"]
+    words += ["data.held_out=64", "trainer.threads=1", "trainer.progress=false"]
+    config, given = compose_config(words), Given(surface=torus_like)
+    whole = run_task(config, tmp_path / "whole", given)
+    written = AtomicCheckpoint.on_train_epoch_end
+
+    def stop(self, trainer, module):
+        written(self, trainer, module)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(AtomicCheckpoint, "on_train_epoch_end", stop)
+        run_task(config, tmp_path / "cut", given)
+    resumed = run_task(config, tmp_path / "cut", given, resuming=True)
+    for before, after in zip(whole.map.parameters(), resumed.map.parameters(), strict=True):
+        assert torch.equal(before, after)
 
 
 def test_figures_of_a_closed_domain_speak_of_no_seam(torus_like):
