@@ -9,6 +9,7 @@ Examples:
 
 from __future__ import annotations
 
+import random
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -65,14 +66,23 @@ _HOME = {
     "register_encoding": "nsm.extensions",
     "register_energy": "nsm.extensions",
 }
+# what extensions are written with: ``nsm.energies``, ``nsm.data``, ...
+_PACKAGES = ("data", "domains", "energies", "maps", "results", "surfaces", "tasks")
 
 
 def __getattr__(name: str) -> Any:
     # torch and Lightning take seconds to import: what needs neither should not wait for them
-    if name not in _HOME:
+    if name not in _HOME and name not in _PACKAGES:
         raise AttributeError(f"module 'nsm' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    state = random.getstate()  # Lightning draws random numbers when it is imported
+    try:
+        if name in _PACKAGES:
+            return import_module(f"nsm.{name}")
+        return getattr(import_module(_HOME[name]), name)
+    finally:
+        random.setstate(state)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    hidden = {"Any", "TYPE_CHECKING", "annotations", "import_module", "random"}
+    return sorted({*globals(), *__all__, *_PACKAGES} - hidden)

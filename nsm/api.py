@@ -8,13 +8,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
-from nsm.config import compose_config, conf_folder, unknown_setting
+from nsm.config import compose_config, conf_folder, dotted, unknown_setting
 from nsm.config_docs import known_keys
 from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
 from nsm.instantiation import target_of
+from nsm.migration import check_override
 from nsm.pipeline import Given, run_task
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.results import (
@@ -204,13 +206,16 @@ class _Request:
             )
         known = {key.partition(".")[0] for key in known_keys()}
         chosen, merged = [], {}
+        for setting in dotted(settings):
+            name, _, text = setting.partition("=")
+            check_override(name, text)
         for key, value in settings.items():
             if key not in known:
                 raise unknown_setting(key)
             if value is None or isinstance(value, str) and (conf_folder() / key).is_dir():
                 chosen.append(f"{key}={'null' if value is None else value}")
             else:
-                merged[key] = _plain(value)
+                merged[key] = _plain(key, value)
         keys = [word.lstrip("+~").partition("=")[0] for word in overrides]
         for key in (*keys, *settings):
             if key != "task" or not isinstance(merged.get(key), dict):  # a variant of the task
@@ -274,15 +279,29 @@ class _Request:
             ) from error
 
 
-def _plain(value: Any) -> Any:
-    """A setting with ``_target_`` for the classes in it."""
-    if inspect.isclass(value):
+def _plain(key: str, value: Any) -> Any:
+    """A setting with ``_target_`` for the classes and functions in it; NsmError for objects."""
+    if inspect.isclass(value) or inspect.isfunction(value):
         return {"_target_": _name(value)}
     if isinstance(value, Mapping):
-        return {k: _name(v) if k == "_target_" else _plain(v) for k, v in value.items()}
+        return {
+            k: _name(v) if k == "_target_" else _plain(f"{key}.{k}", v) for k, v in value.items()
+        }
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+        return [_plain(key, item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    kind = type(value).__name__
+    raise NsmError(
+        f"{key}: an object of {kind} cannot be written down; give its class, or "
+        f'{{"_target_": {kind}, ...}} with its parameters',
+        kind="wrong_type",
+        key=key,
+    )
 
 
 def _name(target: Any) -> Any:

@@ -75,7 +75,10 @@ def _main(arguments: list[str]) -> int:
     elif {"--help", "-h"} & set(arguments):
         from nsm.help import main
 
-        main([argument for argument in arguments if not argument.startswith("-")])
+        parser = Arguments(prog="nsm", add_help=False, allow_abbrev=False)
+        parser.add_argument("--config-dir", "-cd", type=Path)
+        given, rest = parser.parse_known_args(arguments)
+        main([word for word in rest if not word.startswith("-")], given.config_dir)
     elif "--version" in arguments:  # Hydra would print its own
         print(f"nsm {version('nsm')}")
     else:

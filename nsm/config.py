@@ -111,7 +111,7 @@ def compose_config(
     if settings:
         OmegaConf.set_struct(config, False)
         config = OmegaConf.merge(config, OmegaConf.create(dict(settings)))  # type: ignore[assignment]
-    return checked(config, [*overrides, *_dotted(settings or {})])
+    return checked(config, [*overrides, *dotted(settings or {})])
 
 
 def composed(overrides: Sequence[str] = ()) -> tuple[DictConfig, dict[str, str | None]]:
@@ -144,10 +144,11 @@ def _own_hydra() -> Iterator[None]:
         GlobalHydra.instance().hydra = before
 
 
-def _dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Nested settings as on a command line: each as KEY=VALUE."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
-            yield from _dotted(value, f"{prefix}{key}.")
+            yield from dotted(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}={value}"
 

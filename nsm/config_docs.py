@@ -49,8 +49,13 @@ class Group:
     options: dict[str, str]
 
 
-def groups() -> list[Group]:
-    """All groups in the order of the defaults list, but for the task, which comes first."""
+def groups(own: Path | None = None) -> list[Group]:
+    """All groups in the order of the defaults list, but for the task, which comes first.
+
+    Args:
+        own: the user's folder, with options beside those of nsm.
+    """
+    folders = [conf_folder(), *([own] if own else [])]
     found, remark = [], []
     for line in (conf_folder() / "config.yaml").read_text(encoding="utf-8").splitlines():
         entry = _DEFAULT.match(line)
@@ -59,7 +64,9 @@ def groups() -> list[Group]:
         elif entry:
             if remark:  # the others are Hydra's, and no choice of ours
                 name, default = entry.groups()
-                files = sorted((conf_folder() / name).glob("*.yaml"))
+                files = sorted(
+                    file for folder in folders for file in (folder / name).glob("*.yaml")
+                )
                 options = {file.stem: _first_comment(file) for file in files}
                 found.append(Group(name, " ".join(remark), default, options))
             remark = []
@@ -72,14 +79,20 @@ def _first_comment(file: Path) -> str:
     return comments[0].strip("# ") if comments else ""
 
 
-def option_settings(group: str, name: str, run: Mapping[str, Any] | None = None) -> list[Setting]:
+def option_settings(
+    group: str, name: str, run: Mapping[str, Any] | None = None, own: Path | None = None
+) -> list[Setting]:
     """The settings of an option, with their values.
 
     Args:
         group, name: of the option.
         run: the configuration of a run that has chosen it, whose values are shown then.
+        own: the user's folder of options; nsm's take precedence, as in a run.
     """
-    text = (conf_folder() / group / f"{name}.yaml").read_text(encoding="utf-8")
+    file = conf_folder() / group / f"{name}.yaml"
+    if own and not file.is_file():
+        file = own / group / f"{name}.yaml"
+    text = file.read_text(encoding="utf-8")
     package = _PACKAGE.match(text)
     node: Any = OmegaConf.to_container(OmegaConf.create(text))
     node.pop("defaults", None)

@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nsm.config import COLLECTIONS, GROUPS, setting_error, unknown_setting
 from nsm.errors import NsmError
 from nsm.instantiation import made, named_object
+from nsm.migration import check_weights
 from nsm.plugins import import_plugins
 from nsm.settings import Misfit, Parameter, Settings, fit, parameters, parts
 
@@ -43,8 +44,15 @@ EXTRA: dict[str, dict[str, Parameter]] = {
     "loss_terms": {"weight": Parameter(float, remark="what the term is multiplied by")},
     "task": {"name": Parameter(str | None, None, "its name in folders and messages")},
 }
-# settings of the group ``initialization`` in others: a target that lacks them goes without
-_FROM_INITIALIZATION = ("map.linear_skip", "scheduler.peak")
+# settings that initialization and experiment=quick give to others: a target that lacks them goes
+# without
+_FROM_OTHER_GROUPS = (
+    "map.linear_skip",
+    "scheduler.peak",
+    "encoding.resolutions",
+    "data.batch_size",
+    "data.steps_per_epoch",
+)
 _HYDRA_KEYS = ("_target_", "_partial_", "_convert_", "_recursive_", "_args_")
 _LARGEST_NUMBER = 2**63 - 1  # that whole numbers of 64 bits hold
 
@@ -125,7 +133,8 @@ def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, 
             result[k] = _fit(dotted, value, known[k])
         elif others and (dotted in given or not retargeted):
             result[k] = _nested(dotted, value)
-        elif dotted in given or not (retargeted or dotted in _FROM_INITIALIZATION):
+        elif dotted in given or not (retargeted or dotted in _FROM_OTHER_GROUPS):
+            check_weights(dotted)
             raise unknown_setting(dotted, list(known), name)
     for k, parameter in known.items():
         if k in result or result.get("_partial_") or "_args_" in result:

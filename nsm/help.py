@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -39,12 +40,13 @@ answered in one line, with exit status 2. Completion: eval "$(nsm -sc install=ba
 bashcompinit; fish: nsm -sc install=fish | source). Hydra's own flags: --hydra-help."""
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: list[str], own: Path | None = None) -> None:
     """Print the help on the groups and settings that arguments name, or on all groups in short.
 
     Args:
         arguments: names; and overrides, which change the values that are shown. Without a name,
             the settings that the overrides set are the names.
+        own: the user's folder of options, beside those of nsm.
 
     Raises:
         NsmError: a name of neither a group nor a setting.
@@ -52,11 +54,12 @@ def main(arguments: list[str]) -> None:
     overrides = [argument for argument in arguments if "=" in argument]
     names = [argument for argument in arguments if "=" not in argument]
     names = names or [override.partition("=")[0].lstrip("+~") for override in overrides]
-    config, chosen = composed(overrides)
+    search = [f"hydra.searchpath=['file://{own.absolute()}']"] if own else []
+    config, chosen = composed([*search, *overrides])
     run: Any = OmegaConf.to_container(config)
     console = Console(highlight=False, soft_wrap=False)
     for name in names:
-        if not _explained(console, name, run, chosen):
+        if not _explained(console, name, run, chosen, own):
             hint = nearest(name, known_keys(), "see nsm --help")
             message = f"--help {name}: no such group or setting; {hint}"
             raise NsmError(message, kind="unknown_setting", key=name)
@@ -64,7 +67,7 @@ def main(arguments: list[str]) -> None:
         return
     console.print(_USAGE)
     console.print("\n[bold]Groups[/bold] and their options, * by default\n")
-    for group in groups():
+    for group in groups(own):
         _heading(console, group)
         console.print(_options(group, chosen))
         console.print()
@@ -74,7 +77,9 @@ def main(arguments: list[str]) -> None:
     console.print(_CLOSING)
 
 
-def _explained(console: Console, name: str, run: dict[str, Any], chosen: Choices) -> bool:
+def _explained(
+    console: Console, name: str, run: dict[str, Any], chosen: Choices, own: Path | None
+) -> bool:
     """Print a group, a setting or the settings below a name; False if there is none."""
 
     def named(settings: list[Setting]) -> list[Setting]:
@@ -85,7 +90,7 @@ def _explained(console: Console, name: str, run: dict[str, Any], chosen: Choices
         _settings(console, outside)
         console.print()
     found = bool(outside)
-    for group in groups():
+    for group in groups(own):
         key = group.name.replace("/", ".")
         whole = name in (group.name, key)
         if not whole and not name.startswith(f"{key}.") and group.name not in _OVER_OTHERS:
@@ -96,7 +101,7 @@ def _explained(console: Console, name: str, run: dict[str, Any], chosen: Choices
             console.print()
         for option in group.options:
             is_chosen = chosen.get(group.name) == option
-            settings = option_settings(group.name, option, run if is_chosen else None)
+            settings = option_settings(group.name, option, run if is_chosen else None, own)
             shown = settings if whole else named(settings)
             if whole or shown:
                 found = True

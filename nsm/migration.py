@@ -95,7 +95,9 @@ def check_override(key: str, value: str) -> None:
     group, _, last = bare.rpartition(".")
     new = {
         "logger.kinds": "logger=tensorboard, csv, both, wandb, mlflow or none",
-        "trainer": "trainer.SETTING=VALUE, as it is no group any more",
+        "trainer": "trainer.SETTING=VALUE, as it is no group any more"
+        if value == "default"
+        else "",
     }.get(bare)
     if last == "name" and value in TARGETS.get(group, ()):
         new = f"{group}={value}"
@@ -107,6 +109,13 @@ def check_override(key: str, value: str) -> None:
     if new:
         message = f"{key}={value}: it has another name now; give {new}"
         raise NsmError(message, kind="renamed_setting", key=bare)
+
+
+def check_weights(key: str) -> None:
+    """NsmError, with the new form, for ``energy.weights`` of an energy that is no blend."""
+    if key == "energy.weights":
+        message = "a blend is an energy; give energy._target_=nsm.energies.Blend with them"
+        raise NsmError(f"setting {key}: {message}", kind="renamed_setting", key=key)
 
 
 def migrated(settings: Any) -> dict[str, Any]:

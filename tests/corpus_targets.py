@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nsm.pipeline.common import stored_state
 from tiny import Results, results
 
 import nsm
 from nsm.config import read_config
 from nsm.errors import NsmError
+from nsm.pipeline.checkpoints import stored_state
 from nsm.surfaces.landmarks import read_landmarks, read_pairs
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import clean

@@ -11,11 +11,15 @@ PACKAGE = Path(nsm.__file__).parent
 # from left to right; a module imports from its own room and from those before it
 ROOMS = ["surfaces", "maps", "energies", "domains", "data", "tasks", "results", "pipeline"]
 # what every room may import
-COMMON = {"errors", "instantiation", "optional_dependencies"}
+COMMON = {"errors", "instantiation", "optional_dependencies", "settings"}
 # rooms that stand for themselves: meshes in numpy, and maps in torch
 INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}
-# a run knows its configuration, its folder and the sweep that it belongs to
-BESIDE = {"pipeline": {"config", "migration", "run_directories", "sweeps"}}
+# a run knows its configuration, its folder, the sweep that it belongs to and the user's modules;
+# results of older versions are lifted by the table of old names
+BESIDE = {
+    "pipeline": {"config", "migration", "plugins", "run_directories", "sweeps"},
+    "results": {"migration"},
+}
 
 
 def imports_of(file: Path) -> set[str]:

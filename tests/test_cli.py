@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 import sys
 import types
 from importlib.metadata import version
@@ -162,6 +163,22 @@ def test_a_run_of_an_older_version_is_resumed(here, tmp_path):
     assert stored["activation"]["_target_"].startswith("nsm.maps.activations.")
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["steps"] == stored["trainer"]["max_steps"]
+
+
+def test_a_refused_class_is_named_with_its_file(here, tmp_path):
+    shutil.copytree(OLDER / "interrupted", tmp_path, dirs_exist_ok=True)
+    file = tmp_path / "config.yaml"
+    file.write_text(file.read_text() + "\ncallbacks: {mine: {_target_: os.system}}\n")
+    result = here(f"resume={tmp_path}")
+    assert result.returncode == 2
+    assert str(file) in result.stderr and "os.system" in result.stderr
+
+
+@pytest.mark.parametrize("package", ["data", "domains", "energies", "maps", "results", "tasks"])
+def test_packages_are_there_in_any_order(package):
+    command = f"import random, nsm; s = random.getstate(); nsm.{package}; nsm.overfit; "
+    command += "assert s == random.getstate()"
+    subprocess.run([sys.executable, "-c", command], check=True)
 
 
 def test_public_names_are_listed():

@@ -344,7 +344,9 @@ def test_paths_with_special_signs(name):
     assert composed(["surface=cow"])[0].surface.path is None
 
 
-@pytest.mark.parametrize("old", [*RENAMED, *OPTIONS, ("optimizer.name", "adam")])
+@pytest.mark.parametrize(
+    "old", [*RENAMED, *OPTIONS, ("optimizer.name", "adam"), ("trainer", "default")]
+)
 def test_an_old_name_is_answered_with_the_new_one(old):
     key, value = old if isinstance(old, tuple) else (old, "1")
     with pytest.raises(NsmError) as error:
@@ -354,6 +356,22 @@ def test_an_old_name_is_answered_with_the_new_one(old):
         with pytest.raises(NsmError) as error:
             compose_config([f"+{old}.foo=2"])
         assert f"{RENAMED[old]}.foo=2" in str(error.value)
+
+
+def test_weights_of_an_energy_are_answered_with_blend():
+    with pytest.raises(NsmError) as error:
+        compose_config(["task=param", "energy=arap", "energy.weights.arap=1"])
+    assert (error.value.kind, error.value.key) == ("renamed_setting", "energy.weights")
+    blend = ["task=param", "energy._target_=nsm.energies.Blend", "energy.weights.arap=1"]
+    assert compose_config(blend).energy.weights == {"arap": 1}
+
+
+def test_an_experiment_suits_other_options_than_the_default():
+    config = compose_config(["experiment=quick", "encoding=fourier"])
+    assert "resolutions" not in config.encoding
+    with pytest.raises(NsmError) as error:
+        compose_config(["encoding=fourier", "encoding.resolutions=[8]"])
+    assert error.value.key == "encoding.resolutions"
 
 
 def test_new_names_exist():
@@ -540,6 +558,9 @@ class TestFunctions:
             (["surface=cow"], {}, "conflicting_settings", "surface"),
             (["domain=square"], {}, "conflicting_settings", "domain"),
             ("seed=1", {}, "wrong_type", "overrides"),
+            ([], {"lambda": "positions"}, "renamed_setting", "lambda"),
+            ([], {"map": {"readout": "none"}}, "renamed_setting", "map.readout"),
+            ([], {"activation": torch.nn.Mish()}, "wrong_type", "activation"),
         ],
     )
     def test_mistakes(self, request_of, overrides, settings, kind, key):

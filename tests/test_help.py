@@ -139,3 +139,12 @@ def test_the_overview_does_not_wait_for_torch():
 def test_known_keys_are_those_of_the_help():
     shown = {s.key for s in plain_settings(composed()[0])}
     assert shown <= set(known_keys())
+
+
+def test_help_shows_options_of_an_own_folder(here, tmp_path):
+    (tmp_path / "conf" / "energy").mkdir(parents=True)
+    file = tmp_path / "conf" / "energy" / "mine.yaml"
+    file.write_text("_target_: nsm.energies.SymmetricDirichlet\nepsilon: 0.25\n")
+    result = here("--help", "energy", "--config-dir=conf", "task=param", "energy=mine")
+    assert result.returncode == 0, result.stderr
+    assert "* energy=mine" in result.stdout and "energy.epsilon=0.25" in result.stdout

@@ -218,7 +218,7 @@ def _link(target: str, name: str, folder: Path) -> str:
     return name
 
 
-_TAKEN = {"not UTF-8": (REFUSED, "not UTF-8"), "with ${}": (REFUSED, "'${' is not taken")}
+_TAKEN = {"not UTF-8": (REFUSED, "not UTF-8"), "with ${}": (REFUSED, "'${' is not accepted")}
 
 FILES: dict[str, File] = {
     **{f"{f}: whole": File("whole files", partial(_whole, f), SOLVED) for f in FORMATS},

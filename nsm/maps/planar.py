@@ -39,7 +39,9 @@ class IdentityInitializedMap(nn.Module):
                 nn.init.zeros_(last.bias)
         with torch.no_grad():
             start = network(next(network.parameters(), torch.zeros(())).new_full((1, 2), 0.25))
-        if start.shape != (1, self.network_out_dim) or start.count_nonzero():
+        # a sketch without storage has shapes, but no values
+        fits = start.shape == (1, self.network_out_dim)
+        if not fits or not (start.is_meta or not start.count_nonzero()):
             raise NsmError(
                 f"map: its network needs {self.network_out_dim} outputs, and a linear layer at its "
                 "end to start at zero",

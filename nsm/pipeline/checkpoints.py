@@ -52,7 +52,7 @@ def not_a_checkpoint(file: Path) -> NsmError:
 
 def _lift(state: dict[str, Any]) -> bool:
     """Bring a checkpoint to the form of this version; False if it has it."""
-    callbacks = state["callbacks"]
+    callbacks = state.get("callbacks", {})
     old = any(old in state for old in _ENTRIES) or any(old in callbacks for old in _CALLBACKS)
     if not old:
         return False
@@ -63,7 +63,7 @@ def _lift(state: dict[str, Any]) -> bool:
         if before in callbacks:
             callbacks[after] = callbacks.pop(before)
     state["state_dict"] = _renamed(state["state_dict"])
-    good = callbacks["DivergenceGuard"]["good"]
+    good = callbacks.get("DivergenceGuard", {}).get("good")
     if good is not None:
         good["module"] = _renamed(good["module"])
     return True

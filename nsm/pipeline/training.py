@@ -62,7 +62,10 @@ def stored_config(folder: Path, trust: Sequence[str] = ()) -> DictConfig:
             key=str(file),
         )
     stored = read_config(file)
-    check_trusted(plain(stored), trust)
+    try:
+        check_trusted(plain(stored), trust)
+    except NsmError as error:
+        raise NsmError(f"{file}: {error}", kind=error.kind, key=error.key) from error
     return checked(stored)
 
 

@@ -7,7 +7,8 @@ import torch
 import nsm
 from nsm.domains import Disc
 from nsm.errors import NsmError
-from nsm.maps import Rotated, build_planar
+from nsm.maps import DiscMap, NeuralMap, Rotated
+from nsm.maps.activations import Sine
 from nsm.results import SurfaceMap
 from nsm.results.analytic import analytic_surface
 from nsm.results.certificate import Correction, certificate, combined, repaired, verdict
@@ -71,8 +72,8 @@ def folded():
     bowl = analytic_surface({"name": "paraboloid"}, "disc")
     monkeypatch.undo()
     torch.manual_seed(3)
-    network = {"width": 16, "depth": 1, "activation": {"name": "sine", "omega": 6.0}}
-    h = Rotated(build_planar({**network, "onto": "disc"}), torch.eye(2))
+    network = NeuralMap(DiscMap.network_out_dim, width=16, depth=1, activation=Sine(6.0))
+    h = Rotated(DiscMap(network), torch.eye(2))
     for p in h.inner.network.output.parameters():
         torch.nn.init.normal_(p, std=0.045)
     h = h.eval().requires_grad_(False)

@@ -29,8 +29,8 @@ TINY = [
     "data.held_out=256",
     "trainer.max_steps=20",
     "trainer.progress=false",
-    "logger.every=5",
-    "logger.pictures=0",
+    "trainer.log_every=5",
+    "trainer.log_pictures=0",
     "artefacts=false",
 ]
 HOSTILE = "<img src=x onerror=window.pwned=1> %{x} <b>bold<"
@@ -83,7 +83,7 @@ def unpacked(content: dict, index: int) -> np.ndarray:
 def test_figures_and_settings_are_those_of_the_runs(runs, page):
     overfit = task(page, "overfit")
     assert overfit["differing"][0] == "activation"
-    assert {one["label"] for one in overfit["runs"]} >= {"activation=silu", "activation=relu"}
+    assert {one["label"] for one in overfit["runs"]} >= {"activation=SiLU", "activation=ReLU"}
     for one in overfit["runs"]:
         stored = json.loads((runs / one["name"] / "metrics.json").read_text())
         assert one["figures"].items() >= stored["metrics"].items()
@@ -376,13 +376,13 @@ def test_the_table_sorts_and_filters(browser):
     rising = names(browser)
     click(browser, key)
     assert names(browser) == rising[::-1]
-    assert set(rising) == {"activation=silu", "activation=relu"}
+    assert set(rising) == {"activation=SiLU", "activation=ReLU"}
     click(browser, key)
     type_into(browser, "thead input[aria-label='filter activation']", "RELU")
-    assert names(browser) == ["activation=relu"]
+    assert names(browser) == ["activation=ReLU"]
     # filters apply to the plots as well
     plotted = "return document.querySelector('#curves .plot').data.map(x => x.name)"
-    assert browser.execute_script(plotted) == ["activation=relu"]
+    assert browser.execute_script(plotted) == ["activation=ReLU"]
     type_into(browser, "thead input[aria-label='filter activation']", "")
     type_into(browser, "thead input[aria-label='filter RMS distance']", "< 0")
     assert names(browser) == []

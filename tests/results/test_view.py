@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from nsm.domains import Surface
+from nsm.domains import Disc, Surface
 from nsm.errors import NsmError
 from nsm.maps import DiscMap, NeuralMap, Rotated
 from nsm.maps.activations import Tanh
@@ -21,7 +21,6 @@ from nsm.results import (
     Parameterization,
     SurfaceCollection,
     SurfaceMap,
-    analytic,
     save_surface,
 )
 from nsm.results.analytic import analytic_surface
@@ -29,6 +28,7 @@ from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import hit, pick, pick_at
 from nsm.results.view.scene import PLAIN, POSITION, UP_AXES, Paint, scene_of
 from nsm.surfaces.location import Places, locate
+from nsm.surfaces.shapes import ring_mesh
 from nsm.surfaces.topology import boundary_loops
 
 
@@ -43,7 +43,7 @@ def turned(angle: float) -> Rotated:
 @pytest.fixture(scope="module")
 def surfaces():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analytic, "_RINGS", 12)
+        patch.setattr(Disc, "mesh", lambda self: ring_mesh(12))
         shapes = ("sphere_cap", "paraboloid", "cone")
         return [analytic_surface({"name": name}, "disc") for name in shapes]
 
