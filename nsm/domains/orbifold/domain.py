@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 _GRIDS = ("nsm.maps.encodings.SplineGrid", "nsm.maps.SplineGrid")
-# the share of a spline grid's cells that lie in the disc: (π / 4) / 1.05²
-_IN_DISC = math.pi / 4 / 1.05**2
 
 
 class ClosedDomain(Domain):
@@ -151,8 +149,8 @@ class ClosedDomain(Domain):
     ) -> dict[str, Any]:
         """Settings of the spline grid with Ω's symmetries that stands for one on the plane.
 
-        Its levels have as many cells on Ω as a grid of the same ``resolutions`` has on the disc,
-        nearly square in the plane of the surface's lattice.
+        Its tables are as large as those of a grid of the same ``resolutions``, r² cells on Ω;
+        cells are nearly square in the plane of the surface's lattice.
 
         Args:
             settings: of :class:`nsm.maps.SplineGrid`, or of such a grid already.
@@ -176,7 +174,7 @@ class ClosedDomain(Domain):
         aspect = float(np.sqrt(long / short))
         levels = []
         for resolution in settings.get("resolutions", (8, 16, 32, 64, 128)):
-            side = resolution * math.sqrt(_IN_DISC * copies)
+            side = resolution * math.sqrt(copies)
             # a power of two in each number of cells, for multigrid
             step = max(4, 2 ** int(math.log2(max(resolution, 16) / 16)))
             levels.append([max(1, round(side * f / step)) * step for f in (aspect, 1 / aspect)])
