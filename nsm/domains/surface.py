@@ -51,8 +51,8 @@ class Surface:
         scale, center: ``vertices = (original - center) * scale``.
         quality: figures of the preparation (see :meth:`from_arrays`).
         log: repairs, conversions and cuts, a line each.
-        lattice: (2, 2) on a closed domain, with determinant 4: the surface is least distorted in
-            the plane of (lattice / 2) uv. None elsewhere.
+        lattice: (2, 2) on a closed domain: the surface is least distorted in the plane of
+            (lattice / 2) uv, where it has the area of Ω. None elsewhere.
     """
 
     name: str
@@ -308,7 +308,7 @@ class Surface:
             center=center,
             quality=quality,
             log=(*log, *chosen),
-            lattice=flat.lattice,
+            lattice=flat.lattice * np.sqrt(area * scale**2 / flat.area),
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:

@@ -1,8 +1,9 @@
 """Closed domains Ω = R²/Γ: the flat orbifold 2222 for genus 0, the flat torus for genus 1.
 
-The lattice is 2Z × 2Z in coordinates of Ω, whatever the surface. The shape of the surface's own
-lattice (2, 2), with determinant 4, belongs to its layout: distances are measured in the plane of
-(lattice / 2) x, where areas are those of Ω.
+The lattice is 2Z × 2Z in coordinates of Ω, whatever the surface. The surface's own lattice (2, 2)
+belongs to its layout: lengths and areas are measured in the plane of (lattice / 2) x. There, Ω has
+the area π, as the disc has, so that a surface has one size on both, and losses, learning rates and
+weights suit both.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ _GRIDS = ("nsm.maps.encodings.SplineGrid", "nsm.maps.SplineGrid")
 class ClosedDomain(Domain):
     """R²/Γ, with the lattice 2Z × 2Z among Γ, and x ↦ -x too if ``even``."""
 
+    area = math.pi  # in the plane of a surface's lattice
     has_boundary = False
     even: ClassVar[bool]
     low: ClassVar[tuple[float, float]]  # corner of the fundamental domain; the other is (1, 1)
@@ -86,7 +88,8 @@ class ClosedDomain(Domain):
         ``degree`` says how often Ω is covered; it should be one.
         """
         flipped = int(planar_mesh.flipped(uv, faces).sum())
-        degree = float(planar_mesh.signed_areas(uv, faces).sum() / self.area)
+        whole = SIDE**2 / (2 if self.even else 1)  # Ω's area in its own coordinates
+        degree = float(planar_mesh.signed_areas(uv, faces).sum() / whole)
         return {
             "certified": flipped == 0 and abs(degree - 1) < 1e-6,
             "flipped_triangles": flipped,
@@ -209,7 +212,6 @@ class Orbifold(ClosedDomain):
     """
 
     name = "orbifold"
-    area = 2.0
     even = True
     low = (-1.0, 0.0)
 
@@ -243,7 +245,6 @@ class Torus(ClosedDomain):
     """
 
     name = "torus"
-    area = 4.0
     even = False
     low = (-1.0, -1.0)
 

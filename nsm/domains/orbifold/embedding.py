@@ -63,6 +63,11 @@ class Embedding:
         points, lift = self.uv if uv is None else uv, self.lifts(matrix)
         return lift[:, :, :1] * points[self.faces] + SIDE * lift[:, :, 1:]
 
+    @property
+    def area(self) -> float:
+        """Of Ω in the plane of the lattice."""
+        return float(np.linalg.det(self.lattice)) / (1 if self.cones is None else 2)
+
     def copies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The mesh with a copy of a vertex for each of its lifts that a triangle has a corner at.
 
