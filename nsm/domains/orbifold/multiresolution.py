@@ -26,6 +26,7 @@ _LATTICE = 4.0
 _STEPS = 2  # of Newton's method on what was put back
 _NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
 _TRIES = 3
+_SMALL = 1500  # faces of a mesh that may be relaxed after every round
 _WORST = 1e3  # times the mean: a triangle of so much energy is moved on its own
 _LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
 
@@ -158,12 +159,15 @@ def _undone(
     for step in reversed(rounds):
         undo(current, step)
         alive = _alive(current)
-        _put_back(scaled(vertices, current[alive], area), current, layout, step)
+        tight = _put_back(scaled(vertices, current[alive], area), current, layout, step)
         last = step is rounds[0]
         if last or len(alive) >= effort.growth * done:
             done = len(alive)
             steps = effort.last if last else effort.level
             relax_all(vertices, current, alive, layout, held, area, effort, steps)
+        elif tight and len(alive) <= _SMALL:
+            # where there is hardly room, make some before it is used up
+            relax_all(vertices, current, alive, layout, held, area, effort, 1)
 
 
 def relax_all(
@@ -282,8 +286,8 @@ def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.nd
     return group.compose(lift, group.inverse(gauge[faces]))
 
 
-def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Round) -> None:
-    """Give a round's vertices places that flip no triangle."""
+def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Round) -> bool:
+    """Give a round's vertices places that flip no triangle; whether one was hard to find."""
     stars = Stars(vertices, faces, layout.lift, step.vertex, step.corners, step.star)
     uv, lattice = layout.uv, layout.lattice
     b, c = stars.rings(uv, lattice)
@@ -298,6 +302,7 @@ def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Rou
         uv[step.vertex[number]] = at
     for _ in range(_STEPS):
         relax(uv, lattice, stars)
+    return len(missing) > 0
 
 
 def _placed(
