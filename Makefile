@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-activation bench-speed bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-closed bench-activation bench-speed bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -32,6 +32,10 @@ bench-steps: .venv/.nsm-dev
 # Maps between the meshes in MESHES, and flattening compared with libigl: over an hour.
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
+
+# Closed surfaces on the disc and on the orbifold, default settings: ten minutes. MESHES as above.
+bench-closed: .venv/.nsm-dev
+	$(BIN)/python benchmarks/closed_surfaces.py $(if $(MESHES),--meshes $(MESHES))
 
 # One network with each activation, its wrinkles, and a report on the runs: half an hour.
 bench-activation: .venv/.nsm-dev

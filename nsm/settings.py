@@ -198,6 +198,8 @@ class SurfaceSettings:
         name: a mesh of the catalogue.
         seam_vertices: vertices, by their numbers in the file, that the cut passes through; null:
             chosen.
+        cones: for domain=orbifold, four vertices, by their numbers in the file, at its cones; null:
+            chosen.
         parameterization: of the mesh over Ω: slim (low distortion) or tutte.
         cache: keep the prepared surface on disk, under a hash of its content.
     """
@@ -205,6 +207,7 @@ class SurfaceSettings:
     path: str | None = None
     name: str = "terrain"
     seam_vertices: list[int] | None = None
+    cones: list[int] | None = None
     parameterization: Literal["slim", "tutte"] = "slim"
     cache: bool = True
 

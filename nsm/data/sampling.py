@@ -41,6 +41,14 @@ class SurfaceSampler:
         self.cumulative_area = _cumulative(double_area)
         weighted = torch.zeros_like(self.vertices)
         weighted.index_add_(0, self.faces.reshape(-1), cross.repeat_interleave(3, dim=0))
+        self.has_boundary = surface.domain.has_boundary
+        if not self.has_boundary:
+            # copies of a vertex are one point of a smooth surface
+            first, faces = surface.whole()
+            again = torch.empty(len(self.vertices), dtype=torch.int64, device=self.device)
+            again[self.faces] = torch.as_tensor(faces, device=self.device)
+            whole = torch.zeros_like(self.vertices[: len(first)]).index_add_(0, again, weighted)
+            weighted = whole[again]
         self.vertex_normals = weighted / weighted.norm(dim=1, keepdim=True).clamp_min(1e-30)
 
     @cached_property
@@ -68,11 +76,12 @@ class SurfaceSampler:
         has no area in Ω in single precision.
 
         The first of every ``boundary_every`` points is on the mesh's boundary, uniform by length;
-        the others are uniform by area.
+        the others are uniform by area. On a closed domain all are.
         """
         face, weights = self._places(count, generator)
-        on = slice(None, None, boundary_every)
-        face[on], weights[on] = self._boundary_places(len(face[on]), generator)
+        if self.has_boundary:
+            on = slice(None, None, boundary_every)
+            face[on], weights[on] = self._boundary_places(len(face[on]), generator)
         plane, space = self.uv[self.faces[face]].double(), self.vertices[self.faces[face]].double()
         sides = torch.stack([plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0]], dim=2)
         edges = torch.stack([space[:, 1] - space[:, 0], space[:, 2] - space[:, 0]], dim=2)

@@ -1,8 +1,12 @@
-"""Planar domains Ω and surfaces over them: layout, seams, certificates. Disc and square."""
+"""Domains Ω and surfaces over them: layout, seams, certificates.
+
+Disc and square have a boundary; orbifold and torus are closed.
+"""
 
 from nsm.domains.base import BoundedDomain, Domain, Keys
 from nsm.domains.disc import Disc
 from nsm.domains.names import DOMAINS, bounded, domain, from_stored, stored
+from nsm.domains.orbifold.domain import Orbifold, Torus
 from nsm.domains.square import Square
 from nsm.domains.surface import Surface
 
@@ -12,8 +16,10 @@ __all__ = [
     "Disc",
     "Domain",
     "Keys",
+    "Orbifold",
     "Square",
     "Surface",
+    "Torus",
     "bounded",
     "domain",
     "from_stored",

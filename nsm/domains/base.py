@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -67,8 +68,8 @@ class Domain(ABC):
         method: str = "slim",
         name: str = "mesh",
         keys: Any = None,
-    ) -> Embedding:
-        """Lay a mesh (V, 3), (F, 3) of disc shape and the area of Ω out over Ω, injectively.
+    ) -> Any:
+        """Lay a mesh (V, 3), (F, 3) of Ω's topology and area out over Ω, injectively.
 
         Args:
             method: one of :data:`nsm.domains.embedding.METHODS`.
@@ -137,6 +138,17 @@ class Domain(ABC):
         h is the identity where the network is zero, and keeps Ω's boundary or symmetries by
         construction.
         """
+
+    def encoding(
+        self, settings: Mapping[str, Any], lattice: np.ndarray | None = None
+    ) -> dict[str, Any]:
+        """The settings of an encoding with Ω's symmetries, from those that a user gives.
+
+        Args:
+            settings: with ``_target_``.
+            lattice: (2, 2) of the surface, on a closed domain.
+        """
+        return dict(settings)
 
     def symmetric(self, network: nn.Module) -> nn.Module:
         """A surface φ over Ω around a network, with Ω's symmetries by construction."""

@@ -7,10 +7,11 @@ from typing import Any
 
 from nsm.domains.base import BoundedDomain, Domain
 from nsm.domains.disc import Disc
+from nsm.domains.orbifold.domain import Orbifold, Torus
 from nsm.domains.square import Square
 from nsm.errors import NsmError
 
-DOMAINS: dict[str, Domain] = {kind.name: kind() for kind in (Disc, Square)}
+DOMAINS: dict[str, Domain] = {kind.name: kind() for kind in (Disc, Square, Orbifold, Torus)}
 
 
 def domain(given: str | Domain | Mapping[str, Any]) -> Domain:
@@ -44,8 +45,9 @@ def bounded(given: str | Domain | Mapping[str, Any]) -> BoundedDomain:
     """
     found = domain(given)
     if not isinstance(found, BoundedDomain):
+        others = ", ".join(name for name, d in DOMAINS.items() if d.has_boundary)
         raise NsmError(
-            f"domain {found} has no boundary; use one of {', '.join(DOMAINS)}",
+            f"domain {found} has no boundary; use one of {others}",
             kind="wrong_domain",
             key="domain",
         )

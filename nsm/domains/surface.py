@@ -1,4 +1,4 @@
-"""The prepared surface: a disc-shaped mesh with injective coordinates in a planar domain."""
+"""The prepared surface: a mesh with injective coordinates in a domain Ω."""
 
 from __future__ import annotations
 
@@ -27,25 +27,32 @@ from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.validation import CleanMesh, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
+OPTIONAL = ("lattice",)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh cut to a disc, normalised, and parameterised injectively into Ω.
+    """A mesh, normalised and parameterised injectively into Ω.
+
+    For a domain with boundary it is cut to a disc. On a closed domain it is whole: φ gives all
+    copies of a vertex one point. A vertex has a copy for each of its lifts that a triangle needs,
+    so that the three corners of each triangle are in one piece of the plane.
 
     Attributes:
         name: in logs and file names.
         vertices: (V, 3) float64, centred, scaled so that the area is that of Ω.
         faces: (F, 3) int64, counter-clockwise in Ω.
-        uv: (V, 2) float64 in Ω, without flipped triangles.
+        uv: (V, 2) float64 in Ω, or near it on a closed domain, without flipped triangles.
         domain: Ω.
         source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
         cut_vertex: (W,) int64, for each vertex of the mesh file its first copy here (or that of
             the vertex it was merged with); -1 if it is not on the surface.
-        seam_pairs: (T, 2) int64, pairs of vertices on the seam that are one point of the mesh.
+        seam_pairs: (T, 2) int64, pairs of vertices that are copies of one point of the mesh.
         scale, center: ``vertices = (original - center) * scale``.
         quality: figures of the preparation (see :meth:`from_arrays`).
         log: repairs, conversions and cuts, a line each.
+        lattice: (2, 2) on a closed domain: the surface is least distorted in the plane of
+            (lattice / 2) uv, where it has the area of Ω. None elsewhere.
     """
 
     name: str
@@ -60,6 +67,7 @@ class Surface:
     center: np.ndarray = field(repr=False)
     quality: dict[str, float] = field(default_factory=dict, repr=False)
     log: tuple[str, ...] = field(default=(), repr=False)
+    lattice: np.ndarray | None = field(default=None, repr=False)
 
     @classmethod
     def load(
@@ -68,6 +76,7 @@ class Surface:
         *,
         domain: str | Domain = "disc",
         seam_vertices: Sequence[int] | None = None,
+        cones: Sequence[int] | None = None,
         parameterization: str = "slim",
         cache: bool = True,
     ) -> Surface:
@@ -78,7 +87,10 @@ class Surface:
             domain: Ω, or the name of one of :data:`nsm.domains.DOMAINS`.
             seam_vertices: vertices (numbers in the file) that the seam passes through; by default
                 mutually far ones where a seam is needed.
-            parameterization: ``slim`` or ``tutte``.
+            cones: for ``domain="orbifold"``, the four vertices (numbers in the file) at its cones,
+                in the order of (0, 0), (1, 0), (1, 1), (0, 1); by default extremities for which the
+                surface is least distorted.
+            parameterization: ``slim`` or ``tutte``; closed domains have ``slim`` only.
             cache: keep the prepared surface on disk, keyed by content.
 
         Raises:
@@ -104,6 +116,7 @@ class Surface:
             name=name,
             domain=domain,
             seam_vertices=seam_vertices,
+            cones=cones,
             parameterization=parameterization,
             cache=cache,
             log=log,
@@ -118,41 +131,60 @@ class Surface:
         name: str = "mesh",
         domain: str | Domain = "disc",
         seam_vertices: Sequence[int] | None = None,
+        cones: Sequence[int] | None = None,
         parameterization: str = "slim",
         cache: bool = False,
         log: Sequence[str] = (),
     ) -> Surface:
         """Validate, cut, normalise and parameterise a mesh (V, 3), (F, 3).
 
-        ``quality`` holds flipped_triangles, boundary_self_intersections (both 0, or this raises),
-        median_symmetric_dirichlet and tutte_median_symmetric_dirichlet (of the map from Ω to the
-        mesh; for large meshes, Tutte's of the coarse mesh), seam_vertices (the number of
-        ``seam_pairs``) and seconds.
+        The arguments are those of :meth:`load`. ``quality`` holds flipped_triangles,
+        median_symmetric_dirichlet (of the map from Ω to the mesh) and seconds; on a domain with
+        boundary also boundary_self_intersections, tutte_median_symmetric_dirichlet (for large
+        meshes, Tutte's of the coarse mesh) and seam_vertices (the number of ``seam_pairs``). No
+        triangle is flipped and the boundary does not cross itself, or this raises.
 
         Raises:
-            NsmError: the mesh cannot be repaired, cut or flattened without flips.
+            NsmError: the mesh cannot be repaired, cut or flattened without flips;
+                ``wrong_topology`` for a closed domain of another topology; ``wrong_domain`` for
+                ``seam_vertices`` or ``cones`` where the domain has none.
         """
         domain = domain_of(domain)
         check_method(parameterization, name)
         vertices, faces = as_arrays(vertices, faces, name)
         seam = None if seam_vertices is None else _numbers(seam_vertices, f"{name}: seam_vertices")
+        corners = None if cones is None else _numbers(cones, f"{name}: cones")
+        unused, key = (corners, "cones") if domain.has_boundary else (seam, "seam_vertices")
+        if unused is not None:
+            raise NsmError(
+                f"{name}: domain={domain} has no {key.split('_')[0].rstrip('s')}; leave "
+                f"surface.{key} out",
+                kind="wrong_domain",
+                key=f"surface.{key}",
+            )
         options = {"domain": stored_domain(domain), "seam": seam, "method": parameterization}
+        if corners is not None:
+            options["cones"] = corners
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         if stored is not None:
             return cls.from_stored(name, domain, stored)
         mesh = clean(vertices, faces, name)
-        if seam is not None:
-            seam = _merged(seam, mesh, name)
-        cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
-        surface = cls.from_cut(
-            cut,
-            mesh,
-            name=name,
-            domain=domain,
-            parameterization=parameterization,
-            log=(*log, *mesh.log),
-        )
+        about: dict[str, Any] = {
+            "name": name,
+            "domain": domain,
+            "parameterization": parameterization,
+            "log": (*log, *mesh.log),
+        }
+        if domain.has_boundary:
+            if seam is not None:
+                seam = _merged(seam, mesh, name, "seam_vertices")
+            cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
+            surface = cls.from_cut(cut, mesh, **about)
+        else:
+            if corners is not None:
+                corners = _merged(corners, mesh, name, "cones")
+            surface = cls.from_closed(mesh, cones=corners, **about)
         if cache:
             cache_.write(key, surface.to_stored())
         return surface
@@ -222,10 +254,67 @@ class Surface:
             log=(*log, *cut.log, *flat.log),
         )
 
+    @classmethod
+    def from_closed(
+        cls,
+        mesh: CleanMesh,
+        *,
+        name: str = "mesh",
+        domain: str | Domain = "orbifold",
+        parameterization: str = "slim",
+        cones: Sequence[int] | None = None,
+        log: Sequence[str] = (),
+    ) -> Surface:
+        """Normalise a closed mesh and lay it out on a closed domain.
+
+        Args:
+            mesh: the mesh.
+            cones: vertices of it.
+            name, domain, parameterization, log: as for :meth:`from_arrays`.
+
+        Raises:
+            NsmError: see :meth:`nsm.domains.orbifold.domain.ClosedDomain.embed`.
+        """
+        start = time.perf_counter()
+        domain = domain_of(domain)
+        center = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+        centred = mesh.vertices - center
+        area = float(topology.face_areas(centred, mesh.faces).sum())
+        scale = float(np.sqrt(domain.area / area))
+        flat = domain.embed(
+            centred * scale, mesh.faces, method=parameterization, name=name, keys=cones
+        )
+        origin, uv, faces = flat.copies()
+        first = first_copies(origin, len(mesh.vertices))
+        quality = {
+            "flipped_triangles": 0.0,
+            "median_symmetric_dirichlet": float(np.median(flat.distortions(centred))),
+            "seconds": time.perf_counter() - start,
+        }
+        chosen: tuple[str, ...] = ()
+        if flat.cones is not None:
+            chosen = (f"cones at vertices {mesh.source_vertex[flat.cones].tolist()}",)
+        again = np.flatnonzero(first[origin] != np.arange(len(origin)))
+        return cls(
+            name=name,
+            vertices=(centred * scale)[origin],
+            faces=faces,
+            uv=uv,
+            domain=domain,
+            source_vertex=mesh.source_vertex[origin],
+            cut_vertex=np.where(mesh.merged >= 0, first[mesh.merged], -1),
+            seam_pairs=np.stack([first[origin[again]], again], axis=1),
+            scale=scale,
+            center=center,
+            quality=quality,
+            log=(*log, *chosen),
+            lattice=flat.lattice * np.sqrt(area * scale**2 / flat.area),
+        )
+
     def to_stored(self) -> dict[str, np.ndarray]:
         """The arrays from which :meth:`from_stored` makes the surface, given name and domain."""
         details = json.dumps({"quality": self.quality, "log": self.log, "scale": self.scale})
-        arrays = {name: getattr(self, name) for name in ARRAYS}
+        arrays = self.arrays()
         return {**arrays, "words": np.frombuffer(details.encode(), dtype=np.uint8)}
 
     @classmethod
@@ -238,8 +327,23 @@ class Surface:
             scale=details["scale"],
             quality=details["quality"],
             log=(*details["log"], "prepared surface taken from the cache"),
-            **{name: stored[name] for name in ARRAYS},
+            **{name: stored[name] for name in (*ARRAYS, *OPTIONAL) if name in stored},
         )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of :data:`ARRAYS`, and those of :data:`OPTIONAL` that are there."""
+        every = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL)}
+        return {name: array for name, array in every.items() if array is not None}
+
+    def whole(self) -> tuple[np.ndarray, np.ndarray]:
+        """The mesh as it was before copies were made, of a closed domain's surface.
+
+        Returns:
+            the first copies (W,) of the mesh file's vertices, in its order, without those that
+            were removed; and faces (F, 3) of numbers among these.
+        """
+        _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
+        return first, number.reshape(-1)[self.faces]
 
     @property
     def bounding_box_diagonal(self) -> float:
@@ -314,14 +418,14 @@ def _numbers(given: Any, what: str) -> list[int]:
     return numbers
 
 
-def _merged(seam: list[int], mesh: CleanMesh, name: str) -> list[int]:
-    """Seam vertices of the mesh file as vertices of the cleaned mesh, or NsmError."""
-    for vertex in seam:
+def _merged(given: list[int], mesh: CleanMesh, name: str, key: str) -> list[int]:
+    """Vertices of the mesh file as vertices of the cleaned mesh, or NsmError."""
+    for vertex in given:
         if not 0 <= vertex < len(mesh.merged) or mesh.merged[vertex] < 0:
             raise NsmError(
-                f"{name}: seam vertex {vertex} is not on the mesh "
-                f"(vertices 0 to {len(mesh.merged) - 1}); give another seam_vertices",
+                f"{name}: vertex {vertex} is not on the mesh "
+                f"(vertices 0 to {len(mesh.merged) - 1}); give other {key}",
                 kind="not_on_surface",
-                key="seam_vertices",
+                key=key,
             )
-    return mesh.merged[np.array(seam, dtype=np.int64)].tolist()
+    return mesh.merged[np.array(given, dtype=np.int64)].tolist()

@@ -6,6 +6,7 @@ from nsm.maps.batched_maps import batched
 from nsm.maps.composition import Composition, PointMap, Rotated
 from nsm.maps.encodings import Encoding, Identity, RandomFourierFeatures, SplineGrid
 from nsm.maps.inverse import TransitionMap, inverted
+from nsm.maps.lattice_grid import LatticeSplineGrid
 from nsm.maps.networks import BLOCKS, NeuralMap, build_network, build_stored
 from nsm.maps.planar import DiscMap, IdentityInitializedMap, PlanarMap, SquareMap
 
@@ -20,6 +21,7 @@ __all__ = [
     "Formula",
     "Identity",
     "IdentityInitializedMap",
+    "LatticeSplineGrid",
     "NeuralMap",
     "PlanarMap",
     "PointMap",

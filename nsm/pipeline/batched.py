@@ -17,7 +17,7 @@ import pytorch_lightning as pl
 from rich.console import Console
 
 from nsm.data import EnsembleData, SurfaceData
-from nsm.domains import Surface
+from nsm.domains import Surface, domain
 from nsm.errors import NsmError
 from nsm.instantiation import made, target_of
 from nsm.maps.networks import SKIPS
@@ -56,6 +56,8 @@ def common_settings(settings: Mapping[str, Any]) -> dict[str, Any] | None:
         settings["task"]["_target_"] != target_of(OverfitTask)
         or settings["data"]["_target_"] not in (target_of(SurfaceData), "nsm.data.SurfaceData")
         or settings["map"]["block"] not in SKIPS
+        # each surface has a grid of its own lattice
+        or not domain(settings["domain"]).has_boundary
         or settings["loss_terms"]
         or settings["callbacks"]
         or optimizer is None

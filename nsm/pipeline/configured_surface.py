@@ -28,6 +28,7 @@ def configured_surface(config: DictConfig) -> Surface:
         settings.path if settings.path is not None else settings.name,
         domain=domain(config.domain),
         seam_vertices=settings.seam_vertices,
+        cones=settings.get("cones"),  # absent in older run folders
         parameterization=settings.parameterization,
         cache=settings.cache,
     )

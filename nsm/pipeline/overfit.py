@@ -21,6 +21,7 @@ from nsm.results import (
     overfit_metrics,
     reconstruction_image,
 )
+from nsm.results.textures import checkerboard_at
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 
@@ -35,6 +36,7 @@ class OverfitTask(Task):
 
     module, data, result, defaults = Overfit, SurfaceData, NeuralSurface, "overfit"
     table = staticmethod(metrics_table)
+    closed_domains = True
     start: Overfit | None = None
 
     def prepare(self, given: Given) -> None:
@@ -48,7 +50,10 @@ class OverfitTask(Task):
 
     def build(self) -> Any:
         surface = self.surface
-        module = self.module(**self.shared_settings(), diagonal=surface.bounding_box_diagonal)
+        settings = self.shared_settings()
+        settings["encoding"] = self.domain.encoding(settings["encoding"], surface.lattice)
+        module = self.module(**settings, diagonal=surface.bounding_box_diagonal)
+        module.map = self.domain.symmetric(module.map)
         if self.start is not None:
             module.load_state_dict(self.start.state_dict())
         elif self.config.map.get("linear_skip") == "fitted":
@@ -66,7 +71,12 @@ class OverfitTask(Task):
 
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
         vertices, faces, uv = result.to_mesh()
-        export_mesh(folder / "reconstruction.obj", vertices, faces, uv)
-        export_mesh(folder / "reconstruction.glb", vertices, faces, uv, texture=checkerboard())
+        obj, glb = folder / "reconstruction.obj", folder / "reconstruction.glb"
+        if result.surface.domain.has_boundary:
+            export_mesh(obj, vertices, faces, uv)
+            export_mesh(glb, vertices, faces, uv, texture=checkerboard())
+        else:
+            export_mesh(obj, vertices, faces, None)
+            export_mesh(glb, vertices, faces, None, colours=checkerboard_at(uv))
         error_picture(folder / "error.png", result.surface, result)
         checkerboard_picture(folder / "checkerboard.png", result.surface, result)

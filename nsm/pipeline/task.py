@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Surface, domain
+from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
 from nsm.pipeline.training import plain
 from nsm.tasks.training import Training
@@ -59,6 +60,7 @@ class Task:
             ``certificate`` and ``repaired()``.
         defaults: the option of the group ``task`` with the default configuration.
         certified: the result is checked for injectivity and repaired.
+        closed_domains: it works on domains without boundary too.
         table: from the figures to a table to print, or None.
         picture_name: of the pictures in the log.
         config: of the run.
@@ -72,6 +74,7 @@ class Task:
     result: ClassVar[type]
     defaults: ClassVar[str]
     certified: ClassVar[bool] = False
+    closed_domains: ClassVar[bool] = False
     table: ClassVar[Callable[..., Any] | None] = None
     picture_name: ClassVar[str] = "surface"
     config: DictConfig
@@ -88,9 +91,19 @@ class Task:
         return f"{self.name} {self.surface.name}"
 
     def setup(self, config: DictConfig, console: Console) -> None:
-        """Take the settings of a run."""
+        """Take the settings of a run.
+
+        Raises:
+            NsmError: ``wrong_domain``: the task needs a domain with boundary.
+        """
         self.config, self.console = config, console
         self.domain = domain(config.domain)
+        if not (self.domain.has_boundary or self.closed_domains):
+            raise NsmError(
+                f"domain={self.domain} serves task=overfit; take domain=disc for task={self.name}",
+                kind="wrong_domain",
+                key="domain",
+            )
 
     @property
     def settings(self) -> dict[str, Any]:

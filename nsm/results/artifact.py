@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.domains import Surface, from_stored, stored
+from nsm.domains.surface import ARRAYS, OPTIONAL
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
@@ -19,7 +20,6 @@ from nsm.results.points import as_points, check_points
 
 FORMAT = "nsm-surface"
 STEM = "surface"
-_ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,16 @@ class NeuralSurface:
         return uv if weight is None else uv.to(weight.dtype)
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2)."""
-        return self(self.surface.uv), self.surface.faces, self.surface.uv
+        """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2).
+
+        On a closed domain these are the vertices and faces of the mesh file, without copies, so
+        that the mesh is closed; uv is then one lift of each vertex.
+        """
+        surface = self.surface
+        if surface.domain.has_boundary:
+            return self(surface.uv), surface.faces, surface.uv
+        first, faces = surface.whole()
+        return self(surface.uv[first]), faces, surface.uv[first]
 
     def in_original_units(self, points: np.ndarray) -> np.ndarray:
         """Normalised points (N, 3) in the units and place of the mesh file.
@@ -98,9 +106,8 @@ def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
     """
     surface = neural.surface
     tensors = {f"map.{key}": value for key, value in neural.map.state_dict().items()}
-    for name in _ARRAYS:
-        array = np.ascontiguousarray(getattr(surface, name))
-        tensors[f"surface.{name}"] = torch.from_numpy(array.copy())
+    for name, array in surface.arrays().items():
+        tensors[f"surface.{name}"] = torch.from_numpy(np.ascontiguousarray(array).copy())
     metadata = {
         "map": neural.map.config,
         "surface": {
@@ -133,7 +140,10 @@ def load_surface(folder: str | Path, trust: Iterable[str] = ()) -> NeuralSurface
     tensors, metadata = read_pair(path / STEM, FORMAT)
     try:
         about = metadata["surface"]
-        arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in _ARRAYS}
+        arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in ARRAYS}
+        for name in OPTIONAL:
+            if f"surface.{name}" in tensors:
+                arrays[name] = tensors.pop(f"surface.{name}").numpy()
         surface = Surface(
             name=str(about["name"]),
             domain=from_stored(about["domain"], trust),
@@ -160,9 +170,9 @@ def _check_arrays(surface: Surface) -> None:
     for name, shape in expected.items():
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
-    for name in _ARRAYS:
+    for name, array in surface.arrays().items():
         whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
-        if getattr(surface, name).dtype != (np.int64 if whole else np.float64):
+        if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")
     if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
         raise ValueError("no faces, or source_vertex below -1")
@@ -177,5 +187,9 @@ def _check_arrays(surface: Surface) -> None:
             raise ValueError(f"{name} has not {columns} columns")
         if index.size and not 0 <= index.min() <= index.max() < count:
             raise ValueError(f"{name} names a vertex that is not there")
+    if (surface.lattice is None) != surface.domain.has_boundary:
+        raise ValueError("lattice is missing, or there without a closed domain")
+    if surface.lattice is not None and surface.lattice.shape != (2, 2):
+        raise ValueError("lattice is not (2, 2)")
     if not 0 < surface.scale < float("inf"):
         raise ValueError("unknown scale")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,12 +17,15 @@ def export_mesh(
     path: str | Path,
     vertices: np.ndarray,
     faces: np.ndarray,
-    uv: np.ndarray,
+    uv: np.ndarray | None,
     *,
     texture: Image.Image | None = None,
+    colours: np.ndarray | None = None,
 ) -> None:
     """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
 
+    A closed surface without a seam has no coordinates that are continuous on it: it goes without
+    (None), and a GLB file may have colours (V, 3) in [0, 1] at the vertices instead of a texture.
     Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file contains the
     texture; beside an OBJ file go a material file and a PNG.
 
@@ -29,9 +33,9 @@ def export_mesh(
         NsmError: ``unknown_format``: the file's ending is neither .obj nor .glb.
     """
     target = Path(path)
-    coordinates = 0.5 * (np.asarray(uv) + 1)
+    coordinates = None if uv is None else 0.5 * (np.asarray(uv) + 1)
     if target.suffix.lower() == ".glb":
-        atomic_write(target, _glb(vertices, faces, coordinates, texture))
+        atomic_write(target, _glb(vertices, faces, coordinates, texture, colours))
         return
     if target.suffix.lower() != ".obj":
         message = f"{target}: meshes are written as .obj or .glb"
@@ -48,17 +52,29 @@ def export_mesh(
         head = f"mtllib {target.stem}.mtl\nusemtl surface\n"
     lines = [head]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices.tolist()]
-    lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
-    lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
+    if coordinates is None:
+        lines += [f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist()]
+    else:
+        lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
+        lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
     atomic_write(target, "".join(lines).encode())
 
 
 def _glb(
-    vertices: np.ndarray, faces: np.ndarray, coordinates: np.ndarray, texture: Image.Image | None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    coordinates: np.ndarray | None,
+    texture: Image.Image | None,
+    colours: np.ndarray | None,
 ) -> bytes:
     import trimesh
 
-    visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
+    visual: Any = None
+    if coordinates is not None:
+        visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
+    elif colours is not None:
+        # as bytes: trimesh would take other numbers for what they are
+        visual = trimesh.visual.ColorVisuals(vertex_colors=np.rint(255 * colours).astype(np.uint8))
     mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
     data = trimesh.Scene(mesh).export(file_type="glb")
     assert isinstance(data, bytes)

@@ -65,8 +65,9 @@ def overfit_metrics(
     Returns:
         rms_percent and max_percent at matching uv; hausdorff_mesh_to_phi_percent and
         hausdorff_phi_to_mesh_percent, one-sided; normal_error_mean_degrees,
-        normal_error_p95_degrees; degenerate_triangles_percent; seam_gap_percent, the largest
-        distance between the images of two seam vertices that were one point; and the figures of
+        normal_error_p95_degrees; degenerate_triangles_percent; on a domain with boundary,
+        seam_gap_percent, the largest distance between the images of two seam vertices that were
+        one point; and the figures of
         :func:`nsm.results.wrinkles.normal_variation`.
     """
     to_percent = 100 / surface.bounding_box_diagonal
@@ -81,19 +82,23 @@ def overfit_metrics(
     there = point_mesh_distance(points, image, fine_faces)
     some = image[:: len(image) // MOST_POINTS + 1]
     back = point_mesh_distance(some, surface.vertices, surface.faces)
-    seam = surface.uv[surface.seam_pairs.ravel()]
-    gap = np.zeros(1)
-    if len(seam):
-        pairs = evaluate(phi, seam).reshape(-1, 2, 3)
-        gap = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1)
+    seam = {}
+    if surface.domain.has_boundary:
+        seam["seam_gap_percent"] = seam_gap(surface, phi) * to_percent
     return {
         **pointwise_metrics(surface, phi, samples=samples, seed=seed),
         "hausdorff_mesh_to_phi_percent": float(there.max() * to_percent),
         "hausdorff_phi_to_mesh_percent": float(back.max() * to_percent),
         "degenerate_triangles_percent": 100 * _degenerate_share(surface, phi, double_area),
-        "seam_gap_percent": float(gap.max() * to_percent),
+        **seam,
         **normal_variation(surface, phi, seed=seed),
     }
+
+
+def seam_gap(surface: Surface, phi: nn.Module) -> float:
+    """The largest distance between φ's images of two copies of a vertex."""
+    pairs = evaluate(phi, surface.uv[surface.seam_pairs.ravel()]).reshape(-1, 2, 3)
+    return float(np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1).max(initial=0.0))
 
 
 def _cross_and_double_area(surface: Surface) -> tuple[np.ndarray, np.ndarray]:

@@ -106,5 +106,6 @@ def _figures(metrics: Mapping[str, float], rows: Mapping[str, tuple[str, str]]) 
     table = Table("figure", "value", "unit")
     table.columns[1].justify = "right"
     for key, (label, unit) in rows.items():
-        table.add_row(label, f"{metrics[key]:.3f}", unit)
+        if key in metrics:  # a closed domain has no seam to report
+            table.add_row(label, f"{metrics[key]:.3f}", unit)
     return table

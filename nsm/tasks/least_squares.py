@@ -16,14 +16,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from scipy.sparse import csr_matrix, dia_matrix, diags, identity, kron
+from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kron
 from torch import Tensor, nn
 
 from nsm.data import SurfaceSampler
 from nsm.domains import Surface
-from nsm.maps import NeuralMap
+from nsm.maps import LatticeSplineGrid, NeuralMap
 from nsm.maps.encodings import Encoding, SplineGrid, value_and_jacobian_stack
-from nsm.tasks.multigrid import solve
+from nsm.tasks.multigrid import folding, lattice_refinements, solve, solve_through
 
 # samples for each grid point or feature
 _SAMPLES = 4
@@ -108,11 +108,10 @@ def _fit_tables(
     nn.init.zeros_(linear_skip.weight)
     nn.init.zeros_(linear_skip.bias)
     left = target.clone()
-    column = grid.out_dim - grid.features * len(grid.tables)
-    for level, (table, cells) in enumerate(zip(grid.tables, grid.resolutions, strict=True)):
+    column = grid.out_dim - grid.features * len(grid.tables)  # past x itself, if it is a feature
+    for level, table in enumerate(grid.tables):
         count = min(len(uv), max(_FEWEST, _SAMPLES * len(table)))
-        matrix, right = _normal_equations(grid, level, uv[:count], along[:count], left[:, :count])
-        found = torch.as_tensor(solve(matrix, right, cells, grid.degree))
+        found = torch.as_tensor(_best(grid, level, uv[:count], along[:count], left[:, :count]))
         behind = len(uv) if level + 1 < len(grid.tables) else 0
         for part, rows, weights in _seen(grid, level, uv[:behind], along):
             left[:, part] -= (weights[..., None] * found[rows]).sum(dim=2)
@@ -134,29 +133,48 @@ def _seen(
         yield part, rows, _rows(weights, along[part])
 
 
+def _best(grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor) -> np.ndarray:
+    """The entries (rows, 3) of a level's table that fit best, their second differences held
+    small."""
+    if isinstance(grid, LatticeSplineGrid):
+        matrix, right = _on_lattice(grid, level, uv, along, target)
+        return solve_through(matrix, right, lattice_refinements(grid, level))
+    matrix, right = _normal_equations(grid, level, uv, along, target)
+    return solve(matrix, right, grid.resolutions[level], grid.degree)
+
+
+def _sums(
+    grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor, cell: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over the samples of each cell, which see the same rows of the table: products of the
+    weights (k⁴, rows), and of weights and target (rows, k², 3).
+
+    Args:
+        cell: which of the rows that a sample sees has the number of its cell.
+    """
+    rows, taps = len(grid.tables[level]), (grid.degree + 1) ** 2
+    columns = target.shape[2]
+    products = torch.zeros(rows, taps * taps, dtype=torch.float64)
+    wanted = torch.zeros(rows, taps * columns, dtype=torch.float64)
+    for part, seen, weights in _seen(grid, level, uv, along):
+        pairs = torch.einsum("pna,pnb->nab", weights, weights)
+        products.index_add_(0, seen[:, cell], pairs.flatten(1))
+        with_target = torch.einsum("pna,pnk->nak", weights, target[:, part])
+        wanted.index_add_(0, seen[:, cell], with_target.flatten(1))
+    return products.t().contiguous().numpy(), wanted.view(rows, taps, columns).numpy()
+
+
 def _normal_equations(
     grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor
 ) -> tuple[csr_matrix, np.ndarray]:
-    """The matrix (rows, rows) and right side (rows, 3) of a level's table that fits best, its
-    second differences held small."""
+    """The matrix (rows, rows) and right side (rows, 3) of the best entries."""
     side, taps = grid.sides[level], (grid.degree + 1) ** 2
     size, columns = side**2, target.shape[2]
-    # sums over the samples of each cell, which see the same rows
-    products = torch.zeros(size, taps * taps, dtype=torch.float64)
-    wanted = torch.zeros(size, taps * columns, dtype=torch.float64)
-    for part, rows, weights in _seen(grid, level, uv, along):
-        pairs = torch.einsum("pna,pnb->nab", weights, weights)
-        products.index_add_(0, rows[:, 0], pairs.flatten(1))
-        with_target = torch.einsum("pna,pnk->nak", weights, target[:, part])
-        wanted.index_add_(0, rows[:, 0], with_target.flatten(1))
+    of_pairs, of_target = _sums(grid, level, uv, along, target, cell=0)
     # row r of the table is the first that cell r sees; the others lie at fixed offsets from it
     offsets = [i * side + j for i in range(grid.degree + 1) for j in range(grid.degree + 1)]
     diagonals: dict[int, np.ndarray] = {}
     right = np.zeros((size, columns))
-    of_pairs, of_target = (
-        products.t().contiguous().numpy(),
-        wanted.view(size, taps, columns).numpy(),
-    )
     for a, down in enumerate(offsets):
         right[down:] += of_target[: size - down, a]
         for b, across in enumerate(offsets):
@@ -166,8 +184,41 @@ def _normal_equations(
     bend = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(side - 2, side))
     line = identity(side)
     smooth = kron(bend.T @ bend, line) + kron(line, bend.T @ bend)
+    return _smoothed(matrix, smooth), right
+
+
+def _on_lattice(
+    grid: LatticeSplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor
+) -> tuple[csr_matrix, np.ndarray]:
+    """As :func:`_normal_equations`, on a closed domain."""
+    size, columns = len(grid.tables[level]), target.shape[2]
+    middle = (grid.degree + 1) ** 2 // 2
+    of_pairs, of_target = _sums(grid, level, uv, along, target, cell=middle)
+    seen = grid.cell_rows(level).numpy()
+    down, across = np.repeat(seen, seen.shape[1], axis=1), np.tile(seen, seen.shape[1])
+    matrix = coo_matrix(
+        (of_pairs.T.ravel(), (down.ravel(), across.ravel())), shape=(size, size)
+    ).tocsr()
+    right = np.stack(
+        [np.bincount(seen.ravel(), of_target[:, :, k].ravel(), size) for k in range(columns)],
+        axis=1,
+    )
+    n, m = grid.cells(level)
+    bends = []
+    for count in (n, m):
+        shift = identity(count, format="csr")[np.roll(np.arange(count), 1)]
+        bend = shift - 2 * identity(count) + shift.T
+        bends.append(bend.T @ bend)
+    everywhere = kron(bends[0], identity(m)) + kron(identity(n), bends[1])
+    fold = folding(grid, n, m)
+    # of the coefficients of an orbit, each once
+    smooth = fold.T @ everywhere @ fold * (size / (n * m))
+    return _smoothed(matrix, smooth), right
+
+
+def _smoothed(matrix: csr_matrix, smooth: csr_matrix) -> csr_matrix:
     weight = matrix.diagonal().mean()
-    return (matrix + weight * (_SMOOTH * smooth + _RIDGE * identity(size))).tocsr(), right
+    return (matrix + weight * (_SMOOTH * smooth + _RIDGE * identity(matrix.shape[0]))).tocsr()
 
 
 def _fit_weights(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import comb
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix, kron
+import torch
+from scipy.sparse import csr_matrix, diags, kron
 from scipy.sparse.linalg import splu
+
+from nsm.maps import LatticeSplineGrid
 
 # so few cells a side, or an odd number, are solved directly
 _DIRECT = 64
@@ -27,7 +31,16 @@ def solve(matrix: csr_matrix, right: np.ndarray, cells: int, degree: int) -> np.
         right: (rows, m).
         cells, degree: of the grid.
     """
-    cycle = _Cycle(matrix, cells, degree)
+    return solve_through(matrix, right, refinements(cells, degree))
+
+
+def solve_through(matrix: csr_matrix, right: np.ndarray, ups: Sequence[csr_matrix]) -> np.ndarray:
+    """As :func:`solve`, on a grid of another kind.
+
+    Args:
+        ups: from the table of each coarser grid to the next finer one, the finest first.
+    """
+    cycle = _Cycle(matrix, ups)
     x, left = np.zeros_like(right), right.copy()
     aim = _TOLERANCE * np.linalg.norm(right, axis=0)
     direction, before = np.zeros_like(right), np.ones(right.shape[1])
@@ -49,11 +62,11 @@ def solve(matrix: csr_matrix, right: np.ndarray, cells: int, degree: int) -> np.
 class _Cycle:
     """One V-cycle: a Jacobi step, the coarser grid's correction, and a Jacobi step."""
 
-    def __init__(self, matrix: csr_matrix, cells: int, degree: int) -> None:
+    def __init__(self, matrix: csr_matrix, ups: Sequence[csr_matrix]) -> None:
         self.matrix = matrix
         self.coarser: _Cycle | None = None
         self.factors: Any = None
-        if cells <= _DIRECT or cells % 2:
+        if not ups:
             # symmetric and positive: no pivoting, and an ordering that knows it
             self.factors = splu(
                 matrix.tocsc(),
@@ -62,9 +75,9 @@ class _Cycle:
                 options={"SymmetricMode": True},
             )
             return
-        self.up = refinement(cells // 2, degree)
+        self.up = ups[0]
         self.down = self.up.T.tocsr()
-        self.coarser = _Cycle((self.down @ matrix @ self.up).tocsr(), cells // 2, degree)
+        self.coarser = _Cycle((self.down @ matrix @ self.up).tocsr(), ups[1:])
         inverse = 1 / matrix.diagonal()
         x = np.random.default_rng(0).standard_normal(len(inverse))
         for _ in range(_POWERS):
@@ -80,6 +93,45 @@ class _Cycle:
         x = self.jacobi * right
         x = x + self.up @ self.coarser(self.down @ (right - self.matrix @ x))
         return x + self.jacobi * (right - self.matrix @ x)
+
+
+def refinements(cells: int, degree: int) -> list[csr_matrix]:
+    """:func:`refinement` from each coarser grid, the finest first, down to one solved directly."""
+    ups = []
+    while cells > _DIRECT and cells % 2 == 0:
+        cells //= 2
+        ups.append(refinement(cells, degree))
+    return ups
+
+
+def lattice_refinements(grid: LatticeSplineGrid, level: int) -> list[csr_matrix]:
+    """As :func:`refinements`, of a level of a grid on a closed domain."""
+    n, m = grid.cells(level)
+    ups = []
+    while n * m > _DIRECT**2 and n % 2 == 0 and m % 4 == 0:
+        n, m = n // 2, m // 2
+        both = kron(_periodic_refinement(n), _periodic_refinement(m)).tocsr()
+        fine, coarse = folding(grid, 2 * n, 2 * m), folding(grid, n, m)
+        # the fine coefficients of an orbit are equal: their mean is each of them
+        orbit = np.asarray(fine.sum(axis=0)).ravel()
+        ups.append((diags(1 / orbit) @ fine.T @ both @ coarse).tocsr())
+    return ups
+
+
+def folding(grid: LatticeSplineGrid, n: int, m: int) -> csr_matrix:
+    """From a table of n by m cells (rows) to all coefficients (n·m) of the periodic grid."""
+    i, j = torch.meshgrid(torch.arange(n), torch.arange(m), indexing="ij")
+    rows = grid.rows_of(i, j, torch.tensor([n, m])).flatten().numpy()
+    ones = np.ones(n * m)
+    return csr_matrix((ones, (np.arange(n * m), rows)), shape=(n * m, int(rows.max()) + 1))
+
+
+def _periodic_refinement(cells: int) -> csr_matrix:
+    """The two-scale relation of quadratic splines along an axis, (2·cells, cells)."""
+    coarse = np.arange(cells)
+    fine = np.concatenate([(2 * coarse - 1 + k) % (2 * cells) for k in range(4)])
+    weights = np.repeat([0.25, 0.75, 0.75, 0.25], cells)
+    return csr_matrix((weights, (fine, np.tile(coarse, 4))), shape=(2 * cells, cells))
 
 
 def refinement(cells: int, degree: int) -> csr_matrix:

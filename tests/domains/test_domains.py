@@ -254,7 +254,7 @@ def test_domains_by_name_settings_and_value():
     assert domains.domain(Square()) == Square() and hash(Square()) == hash(domains.domain("square"))
     assert domains.domain(Square().config) == Square()
     assert domains.domain({"_target_": "nsm.domains.Disc"}) == Disc()
-    assert [str(d) for d in domains.DOMAINS.values()] == ["disc", "square"]
+    assert [str(d) for d in domains.DOMAINS.values()] == ["disc", "square", "orbifold", "torus"]
     for wrong, kind in (("circle", "unknown_option"), (3, "wrong_type"), (None, "wrong_type")):
         with pytest.raises(NsmError) as error:
             domains.domain(wrong)

@@ -74,7 +74,7 @@ def read_shapes(
 def _overfit(folder: Path, trust: Sequence[str]) -> _Read:
     neural = load_surface(folder, trust=trust)
     surface = neural.surface
-    vertices, faces, _ = neural.to_mesh()
+    vertices, faces = neural(surface.uv), surface.faces
     distortion = _measured(surface.vertices, vertices, faces)
     colours = {
         "distance, % of diagonal": vertex_error(surface, neural.map),

@@ -1,0 +1,174 @@
+"""The four cones of an orbifold: extremities of the surface, chosen by the domain they give."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from nsm.domains.decimation import coarsen, present_faces
+from nsm.domains.orbifold.lifts import cone_lifts
+from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
+from nsm.domains.orbifold.newton import distortions
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+
+_FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
+_LARGE = 40_000
+_FEW = 400  # of the mesh on which all candidates are compared
+_EXTREMITIES = 6
+_CLOSE = 0.12  # of the largest distance: two extremities nearer than this are one
+_SOURCES = 96
+_FINALISTS = 2
+_QUICK = Effort(coarse=_FEW, level=3, last=6, stop=1e-3)
+_LONGER = Effort(level=3, last=8, stop=1e-3)
+
+
+def decimated(
+    vertices: np.ndarray, faces: np.ndarray, count: int, held: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """About ``count`` faces (F', 3) of a coarser mesh, and the vertices (V',) that it keeps."""
+    mask = np.zeros(len(vertices), dtype=bool)
+    if held is not None:
+        mask[held] = True
+    coarse = present_faces(coarsen(vertices, faces, mask, count)[0])
+    ids, local = topology.renumbered(coarse, len(vertices))
+    return local[coarse], ids
+
+
+def extremities(vertices: np.ndarray, faces: np.ndarray, count: int = _EXTREMITIES) -> np.ndarray:
+    """Up to ``count`` tips (K,) of a closed mesh (V, 3), (F, 3), the most prominent first.
+
+    Farthest points, each moved to a maximum of the mean geodesic distance nearby.
+    """
+    coarse, ids = decimated(vertices, faces, _FACES)
+    points = vertices[ids]
+    pairs = topology.edges_of(coarse).pairs
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).clip(1e-300)
+    n = len(ids)
+    graph = csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+
+    def distance(v: int) -> np.ndarray:
+        return np.asarray(dijkstra(graph, directed=False, indices=v))
+
+    # sources spread evenly, by farthest points; weighted by the area that is nearest to each
+    sources, nearest = [0], distance(0)
+    rows = [nearest]
+    while len(sources) < min(_SOURCES, n):
+        sources.append(int(nearest.argmax()))
+        rows.append(distance(sources[-1]))
+        nearest = np.minimum(nearest, rows[-1])
+    table = np.stack(rows)
+    area = np.repeat(topology.face_areas(points, coarse) / 3, 3)
+    of_vertex = np.bincount(coarse.ravel(), weights=area, minlength=n)
+    weight = np.bincount(table.argmin(axis=0), weights=of_vertex, minlength=len(sources))
+    mean = weight @ table / weight.sum()
+
+    largest = float(table.max())
+    chosen: list[int] = []
+    away = mean  # the first: farthest from everything
+    while len(chosen) < min(count, n):
+        v = int(away.argmax())
+        if chosen and away[v] < _CLOSE * largest:
+            break
+        near = distance(v) < 0.5 * _CLOSE * largest
+        v = int(np.where(near, mean, -1.0).argmax())
+        if v in chosen:
+            # the maximum nearby is taken already: nothing new is to be found here
+            away = np.where(near, 0.0, away)
+            continue
+        row = distance(v)
+        away = row if not chosen else np.minimum(away, row)
+        chosen.append(v)
+    return ids[chosen]
+
+
+def score(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cones: np.ndarray,
+    effort: Effort,
+    levels: Hierarchy | None = None,
+) -> float:
+    """The area-weighted mean logarithm of the distortion of a mesh laid out with given cones."""
+    lift, _ = cone_lifts(vertices, faces, cones.tolist())
+    layout = laid_out(vertices, faces, lift, cones, effort=effort, levels=levels)
+    x = layout.uv @ np.linalg.inv(layout.lattice).T
+    area = topology.face_areas(vertices, faces)
+    value = np.log(distortions(vertices, faces, layout.lift, x, layout.lattice))
+    return float((area * value).sum() / area.sum())
+
+
+def choose_cones(
+    vertices: np.ndarray, faces: np.ndarray, candidates: np.ndarray | None = None
+) -> tuple[np.ndarray, list[tuple[float, tuple[int, ...]]]]:
+    """Four vertices of a closed mesh of genus 0 whose orbifold is little distorted.
+
+    All sets of four of the candidates are laid out on a few hundred faces, the best again on
+    about 3,000. Their cyclic order does not matter while the lattice's shape is free: another
+    order is another basis of the lattice.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        candidates: (K,) at least four vertices; the extremities if not given.
+
+    Returns:
+        the cones (4,), and all scores, best first: mean logarithm of the distortion, and cones.
+    """
+    if len(faces) > _LARGE:
+        # everything below draws the mesh together anew: start from less
+        coarse, ids = decimated(vertices, faces, _LARGE // 2, candidates)
+        local = None if candidates is None else np.searchsorted(ids, candidates)
+        cones, table = choose_cones(vertices[ids], coarse, local)
+        return ids[cones], [(s, tuple(ids[list(four)].tolist())) for s, four in table]
+    if candidates is None:
+        candidates = extremities(vertices, faces)
+        if len(candidates) < 4:
+            candidates = _four_apart(vertices, faces, candidates)
+    candidates = np.asarray(candidates, dtype=np.int64)
+    sets = [np.array(four) for four in combinations(range(len(candidates)), 4)]
+    scores = _scored(vertices, faces, candidates, sets, _FEW, _QUICK)
+    if len(sets) > 1:
+        best = [sets[k] for k in np.argsort(scores)[:_FINALISTS]]
+        again = _scored(vertices, faces, candidates, best, _FACES, _LONGER)
+        sets = [best[k] for k in np.argsort(again)]
+        scores = sorted(again)
+    table = [
+        (s, tuple(int(v) for v in candidates[four])) for s, four in zip(scores, sets, strict=True)
+    ]
+    return np.array(table[0][1]), table
+
+
+def _scored(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    candidates: np.ndarray,
+    sets: list[np.ndarray],
+    count: int,
+    effort: Effort,
+) -> list[float]:
+    coarse, ids = decimated(vertices, faces, count, candidates)
+    local, points = np.searchsorted(ids, candidates), vertices[ids]
+    held = np.zeros(len(ids), dtype=bool)
+    held[local] = True
+    levels = hierarchy(points, coarse, held, effort)
+    scores = []
+    for four in sets:
+        try:
+            scores.append(score(points, coarse, local[four], effort, levels))
+        except NsmError:  # squeezed below what digits hold
+            scores.append(np.inf)
+    return scores
+
+
+def _four_apart(vertices: np.ndarray, faces: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Four vertices far from each other, in space, that begin with those found."""
+    used = np.unique(faces)
+    chosen = [int(v) for v in found] or [int(used[0])]
+    while len(chosen) < 4:
+        gap = np.linalg.norm(vertices[used][:, None] - vertices[chosen][None], axis=2).min(axis=1)
+        chosen.append(int(used[gap.argmax()]))
+    return np.array(chosen)

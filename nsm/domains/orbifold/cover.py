@@ -1,0 +1,60 @@
+"""Points of Ω = R²/Γ and their lifts: the nearest lift, and the place on the mesh."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.embedding import SIDE, Embedding
+from nsm.surfaces.location import Places, locate
+
+
+def lifted_near(
+    points: np.ndarray, near: np.ndarray, symmetric: bool, lattice: np.ndarray | None = None
+) -> np.ndarray:
+    """Of all lifts of points (N, 2) those (N, 2) that are nearest to others (N, 2).
+
+    Args:
+        points, near: in coordinates of Ω.
+        symmetric: whether x and -x are one point: the orbifold.
+        lattice: (2, 2) of an embedding, by whose plane distances are measured; of Ω if not given.
+    """
+    shape = np.eye(2) if lattice is None else lattice / SIDE
+    best = np.empty_like(points, dtype=np.float64)
+    least = np.full(len(points), np.inf)
+    for sign in (1, -1) if symmetric else (1,):
+        first = sign * points + SIDE * np.rint((near - sign * points) / SIDE)
+        for shift in product((-1, 0, 1), repeat=2):
+            lift = first + SIDE * np.array(shift)
+            distance = np.linalg.norm((lift - near) @ shape.T, axis=1)
+            closer = distance < least
+            best[closer], least[closer] = lift[closer], distance[closer]
+    return best
+
+
+def triangles_over_domain(corners: np.ndarray, symmetric: bool) -> tuple[np.ndarray, np.ndarray]:
+    """All lifts of triangles (F, 3, 2) that meet the fundamental domain: (K, 3, 2), faces (K,)."""
+    low = np.array([-1.0, 0.0 if symmetric else -1.0])
+    parts, numbers = [], []
+    for sign, m, n in product((1, -1) if symmetric else (1,), (-1, 0, 1), (-1, 0, 1)):
+        moved = sign * corners + SIDE * np.array([m, n])
+        meets = (moved.max(axis=1) >= low).all(axis=1) & (moved.min(axis=1) <= 1.0).all(axis=1)
+        parts.append(moved[meets])
+        numbers.append(np.flatnonzero(meets))
+    return np.concatenate(parts), np.concatenate(numbers)
+
+
+def located(embedding: Embedding, points: np.ndarray) -> Places:
+    """Where points (N, 2) of Ω, in any lift, lie on the mesh: faces and barycentric weights."""
+    return located_on(embedding.corners(), points, embedding.cones is not None)
+
+
+def located_on(corners: np.ndarray, points: np.ndarray, symmetric: bool) -> Places:
+    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift near the domain."""
+    x, _ = group.into_domain(points / SIDE, symmetric)
+    corners, number = triangles_over_domain(corners, symmetric)
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    found = locate(SIDE * x, corners.reshape(-1, 2), faces)
+    return Places(number[found.face], found.weights)

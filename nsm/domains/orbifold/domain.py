@@ -1,0 +1,274 @@
+"""Closed domains Ω = R²/Γ: the flat orbifold 2222 for genus 0, the flat torus for genus 1.
+
+The lattice is 2Z × 2Z in coordinates of Ω, whatever the surface. The surface's own lattice (2, 2)
+belongs to its layout: lengths and areas are measured in the plane of (lattice / 2) x. There, Ω has
+the area π, as the disc has, so that a surface has one size on both, and losses, learning rates and
+weights suit both.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from nsm.domains import planar_mesh
+from nsm.domains.base import Domain
+from nsm.domains.orbifold.cover import located_on
+from nsm.domains.orbifold.embedding import SIDE, Embedding, embed_orbifold, embed_torus
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+from nsm.surfaces.location import Places
+from nsm.surfaces.shapes import grid_mesh
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+_GRIDS = ("nsm.maps.encodings.SplineGrid", "nsm.maps.SplineGrid")
+
+
+class ClosedDomain(Domain):
+    """R²/Γ, with the lattice 2Z × 2Z among Γ, and x ↦ -x too if ``even``."""
+
+    area = math.pi  # in the plane of a surface's lattice
+    has_boundary = False
+    even: ClassVar[bool]
+    low: ClassVar[tuple[float, float]]  # corner of the fundamental domain; the other is (1, 1)
+
+    @abstractmethod
+    def embed(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        method: str = "slim",
+        name: str = "mesh",
+        keys: Any = None,
+    ) -> Embedding:
+        """Lay a closed mesh (V, 3), (F, 3) out over Ω.
+
+        Args:
+            method: ``slim``: least symmetric Dirichlet energy.
+            name: of the mesh, in messages.
+            keys: four vertices at the cones of an orbifold; chosen if not given.
+
+        Raises:
+            NsmError: ``wrong_topology``: the surface has a boundary or another genus;
+                ``unknown_option``, ``wrong_cones`` or ``not_injective``.
+        """
+
+    def _check(self, faces: np.ndarray, method: str, name: str) -> None:
+        if method != "slim":
+            raise NsmError(
+                f"{name}: domain={self} has no parameterization {method!r}; take slim",
+                kind="unknown_option",
+                key="parameterization",
+            )
+        what, other = "has a boundary", "disc"
+        if bool((topology.edges_of(faces).count == 2).all()):
+            genus = 1 - topology.euler_characteristic(faces) // 2
+            if genus == (0 if self.even else 1):
+                return
+            what = f"is closed and of genus {genus}"
+            other = {0: "orbifold", 1: "torus"}.get(genus, "disc")
+        raise NsmError(
+            f"{name}: it {what}, which domain={self} cannot take; take domain={other}",
+            kind="wrong_topology",
+            key="domain",
+        )
+
+    def certificate(self, uv: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+        """As :meth:`Domain.certificate`; each triangle in one lift, as those of a surface are.
+
+        ``degree`` says how often Ω is covered; it should be one.
+        """
+        flipped = int(planar_mesh.flipped(uv, faces).sum())
+        whole = SIDE**2 / (2 if self.even else 1)  # Ω's area in its own coordinates
+        degree = float(planar_mesh.signed_areas(uv, faces).sum() / whole)
+        return {
+            "certified": flipped == 0 and abs(degree - 1) < 1e-6,
+            "flipped_triangles": flipped,
+            "degree": degree,
+        }
+
+    def repaired(
+        self, rest: np.ndarray, faces: np.ndarray, image: np.ndarray, held: np.ndarray
+    ) -> np.ndarray:
+        """Not available: maps of closed domains are not repaired.
+
+        Raises:
+            NsmError: ``wrong_domain``.
+        """
+        raise NsmError(
+            f"domain={self} has no repair of maps; take domain=disc",
+            kind="wrong_domain",
+            key="domain",
+        )
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Mask (...) of the points (..., 2) of the fundamental domain."""
+        return np.asarray(((points >= self.low) & (points <= 1.0)).all(axis=-1))
+
+    def locate(self, points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Places:
+        """The places of points (N, 2), in any lift, on a mesh laid out over Ω."""
+        return located_on(uv[faces], points, self.even)
+
+    def lift(self, points: Tensor, near: Tensor) -> Tensor:
+        """The lifts of points (N, 2) nearest to others (N, 2), in coordinates of Ω."""
+        import torch
+
+        lifts = []
+        for sign in (1.0, -1.0) if self.even else (1.0,):
+            first = sign * points + SIDE * torch.round((near - sign * points).detach() / SIDE)
+            lifts += [
+                first + SIDE * points.new_tensor(shift) for shift in product((-1, 0, 1), repeat=2)
+            ]
+        every = torch.stack(lifts)
+        best = (every - near).detach().norm(dim=-1).argmin(dim=0)
+        return every[best, torch.arange(len(points), device=points.device)]
+
+    def nearest_rotation(self, rotation: Tensor) -> Tensor:
+        """The identity (2, 2): a lattice of general shape has no other rotation."""
+        import torch
+
+        return torch.eye(2, dtype=rotation.dtype, device=rotation.device)
+
+    def rotations(self) -> np.ndarray:
+        return np.eye(2)[None]
+
+    def mesh(self, rings: int = 60) -> tuple[np.ndarray, np.ndarray]:
+        """A grid of points (V, 2) of the fundamental domain, and triangles (F, 3)."""
+        points, faces = grid_mesh(2 * rings)
+        low = np.array(self.low)
+        return low + (1 - low) * 0.5 * (points + 1), faces
+
+    def encoding(
+        self, settings: Mapping[str, Any], lattice: np.ndarray | None = None
+    ) -> dict[str, Any]:
+        """Settings of the spline grid with Ω's symmetries that stands for one on the plane.
+
+        Its tables are as large as those of a grid of the same ``resolutions``, r² cells on Ω;
+        cells are nearly square in the plane of the surface's lattice.
+
+        Args:
+            settings: of :class:`nsm.maps.SplineGrid`, or of such a grid already.
+            lattice: (2, 2) of the surface; square by default.
+
+        Raises:
+            NsmError: ``wrong_domain`` for any other encoding.
+        """
+        target = str(settings.get("_target_"))
+        if target.endswith(".LatticeSplineGrid"):
+            return dict(settings)
+        if target not in _GRIDS or settings.get("degree", 2) != 2:
+            raise NsmError(
+                f"setting encoding: domain={self} needs encoding=spline_grid of degree 2, which it "
+                "makes periodic; or take domain=disc",
+                kind="wrong_domain",
+                key="encoding",
+            )
+        copies = 2 if self.even else 1
+        long, short = (1.0, 1.0) if lattice is None else np.linalg.norm(lattice, axis=0)
+        aspect = float(np.sqrt(long / short))
+        levels = []
+        for resolution in settings.get("resolutions", (8, 16, 32, 64, 128)):
+            side = resolution * math.sqrt(copies)
+            # a power of two in each number of cells, for multigrid
+            step = max(4, 2 ** int(math.log2(max(resolution, 16) / 16)))
+            levels.append([max(1, round(side * f / step)) * step for f in (aspect, 1 / aspect)])
+        grid = {"_target_": "nsm.maps.lattice_grid.LatticeSplineGrid", "resolutions": levels}
+        return {**grid, "features": settings.get("features", 4), "even": self.even}
+
+    def symmetric(self, network: nn.Module) -> nn.Module:
+        """A surface φ over Ω: the network itself, whose encoding has the symmetries.
+
+        Raises:
+            NsmError: ``unsuitable_network`` if it does not (see :meth:`encoding`).
+        """
+        from nsm.maps import LatticeSplineGrid
+
+        grid = getattr(network, "encoding", None)
+        if not isinstance(grid, LatticeSplineGrid) or grid.even < self.even:
+            raise NsmError(
+                f"domain={self} needs a network whose encoding has its symmetries; take "
+                "encoding=spline_grid",
+                kind="unsuitable_network",
+                key="encoding",
+            )
+        return network
+
+
+@dataclass(frozen=True)
+class Orbifold(ClosedDomain):
+    """The flat orbifold 2222, for closed surfaces of genus 0.
+
+    Γ is generated by the translations by 2e₁ and 2e₂ and by x ↦ -x. The fundamental domain is
+    [-1, 1] × [0, 1]; four cones of angle π lie at (0, 0), (1, 0), (1, 1) and (0, 1).
+    """
+
+    name = "orbifold"
+    even = True
+    low = (-1.0, 0.0)
+
+    def embed(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        method: str = "slim",
+        name: str = "mesh",
+        keys: Any = None,
+    ) -> Embedding:
+        """See :meth:`ClosedDomain.embed` and
+        :func:`nsm.domains.orbifold.embedding.embed_orbifold`."""
+        self._check(faces, method, name)
+        return embed_orbifold(vertices, faces, keys)
+
+    def equivariant(self, network: nn.Module) -> nn.Module:
+        """h(x) = x + ½(n(x) - n(-x)) around a periodic network n."""
+        from nsm.domains.orbifold.maps import EquivariantMap
+        from nsm.maps import PlanarMap
+
+        return EquivariantMap(PlanarMap(network).network)
+
+
+@dataclass(frozen=True)
+class Torus(ClosedDomain):
+    """The flat torus, for closed surfaces of genus 1: Γ is the translations by 2e₁ and 2e₂.
+
+    The fundamental domain is [-1, 1]².
+    """
+
+    name = "torus"
+    even = False
+    low = (-1.0, -1.0)
+
+    def embed(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        method: str = "slim",
+        name: str = "mesh",
+        keys: Any = None,
+    ) -> Embedding:
+        """See :meth:`ClosedDomain.embed` and
+        :func:`nsm.domains.orbifold.embedding.embed_torus`."""
+        self._check(faces, method, name)
+        if keys is not None:
+            raise NsmError(
+                f"{name}: a torus has no cones; leave cones out", kind="wrong_domain", key="cones"
+            )
+        return embed_torus(vertices, faces)
+
+    def equivariant(self, network: nn.Module) -> nn.Module:
+        """h(x) = x + n(x) around a periodic network n."""
+        from nsm.domains.orbifold.maps import TorusMap
+        from nsm.maps import PlanarMap
+
+        return TorusMap(PlanarMap(network).network)

@@ -1,0 +1,111 @@
+"""Spline grids on closed domains R²/Γ: periodic, and even on the orbifold, by construction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from nsm.maps.encodings import SplineGrid, _bspline, _config
+
+_DEGREE = 2
+_TAPS = torch.arange(-1, 2)
+
+
+class LatticeSplineGrid(SplineGrid):
+    """Multi-resolution grids on R²/Γ, blended by uniform quadratic B-splines: C¹ everywhere.
+
+    The lattice is 2Z × 2Z. With ``even``, x and -x have the same features too: Γ is then the group
+    of the orbifold 2222. Points are moved into the fundamental domain first, so that the lifts of a
+    point differ by the rounding of their coordinates only, and tables hold one entry for each orbit
+    of coefficients. Unlike :class:`SplineGrid`, the features do not include x, which has no
+    symmetry.
+
+    Args:
+        resolutions: cells (N₁, N₂) along the two axes of the lattice's cell [-1, 1]², for each
+            level; N₂ is even.
+        features: of each level.
+        even: whether x and -x are one point.
+
+    Raises:
+        ValueError: a parameter is out of range.
+    """
+
+    def __init__(
+        self, resolutions: Sequence[Sequence[int]], features: int = 4, even: bool = False
+    ) -> None:
+        nn.Module.__init__(self)
+        cells = [[int(n) for n in level] for level in resolutions]
+        self._cells = cells
+        if not cells or any(len(c) != 2 or min(c) < 4 or c[1] % 2 for c in cells):
+            raise ValueError("encoding.resolutions needs pairs of 4 cells or more, the second even")
+        if features < 1:
+            raise ValueError("encoding.features must be positive")
+        self.resolutions = cells  # type: ignore[assignment]  # pairs, not one number a level
+        self.features, self.degree, self.even = features, _DEGREE, even
+        self.config = _config(self, 2, resolutions=cells, features=features, even=even)
+        self.tables = nn.ParameterList(
+            nn.Parameter(1e-2 * torch.randn(n * m // (2 if even else 1), features))
+            for n, m in cells
+        )
+        self.out_dim = features * len(cells)
+
+    def cells(self, level: int) -> tuple[int, int]:
+        """Cells (N₁, N₂) of a level along the two axes."""
+        n, m = self._cells[level]
+        return n, m
+
+    def rows_of(self, i: Tensor, j: Tensor, cells: Tensor) -> Tensor:
+        """Rows (...) of a table for coefficients (i, j), any integers (...), of a grid of cells
+        (..., 2)."""
+        n, m = cells[..., 0], cells[..., 1]
+        i, j = torch.remainder(i, n), torch.remainder(j, m)
+        if not self.even:
+            return i * m + j
+        # x → -x takes (i, j) to (N₁ - 1 - i, N₂ - 1 - j): the upper half stands for both
+        low = j < m // 2
+        i, j = torch.where(low, n - 1 - i, i), torch.where(low, m - 1 - j, j)
+        return i * (m // 2) + j - m // 2
+
+    def cell_rows(self, level: int) -> Tensor:
+        """Rows (rows, 9) that the points of each cell of Ω see; the cell of row r is number r."""
+        n, m = self.cells(level)
+        i, j = torch.meshgrid(
+            torch.arange(n), torch.arange(m // 2 if self.even else 0, m), indexing="ij"
+        )
+        i, j = i.reshape(-1, 1, 1) + _TAPS[:, None], j.reshape(-1, 1, 1) + _TAPS
+        return self.rows_of(i, j, torch.tensor([n, m])).flatten(1)
+
+    def _seen(
+        self, x: Tensor, resolutions: Sequence[int] | None = None
+    ) -> tuple[Tensor, list[list[Tensor]]]:
+        """As :meth:`SplineGrid._seen`."""
+        cells = torch.tensor(resolutions or self.resolutions, device=x.device)  # (L, 2)
+        y = (x - 2 * torch.round(x / 2)).t()  # (2, N) in [-1, 1]
+        sign = torch.ones_like(y[0])
+        if self.even:
+            turned = (y[1] < 0) | ((y[1] == 0) & (y[0] < 0))
+            sign = torch.where(turned, -sign, sign).detach()
+            y = sign * y
+        size = cells[:, :, None].to(x.dtype)
+        z = (y + 1) * (0.5 * size)
+        cell = z.detach().floor().clamp(min=0).minimum(size - 1)
+        weights, slopes, bends = _bspline(z - cell, _DEGREE)
+        taps = _TAPS.to(x.device)
+        i = cell[:, 0, None, None].long() + taps[:, None, None]
+        j = cell[:, 1, None, None].long() + taps[None, :, None]
+        rows = self.rows_of(i, j, cells[:, None, None, None])
+        rate = 0.5 * size * sign
+        scaled = [[w * rate for w in slopes], [w * rate * rate for w in bends]]
+        return rows.flatten(1, 2), [weights, *scaled]
+
+    @staticmethod
+    def _blended(
+        x: Tensor, rows: Tensor, orders: list[list[Tensor]], tables: list[Tensor]
+    ) -> Tensor:
+        return SplineGrid._blended(x, rows, orders, tables)[..., 2:]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Points (N, 2) in any lift to features (N, out_dim)."""
+        return super().forward(x)[..., 2:]

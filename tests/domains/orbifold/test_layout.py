@@ -1,0 +1,168 @@
+"""Energies, steps, and layouts without flips."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from domains.orbifold.shapes import hull, limbs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.certificate import certificate, torn_edges
+from nsm.domains.orbifold.collapses import collapsed
+from nsm.domains.orbifold.lifts import cone_lifts
+from nsm.domains.orbifold.multiresolution import Effort, laid_out, scaled
+from nsm.domains.orbifold.newton import Quotient, distortions
+from nsm.domains.orbifold.sweeps import colour_classes, relax
+from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
+from nsm.surfaces import topology
+
+
+def _problem(seed: int = 1, count: int = 25):  # type: ignore[no-untyped-def]
+    vertices, faces = hull(seed, count)
+    cones = np.array([0, 6, 12, 18])
+    lift, _ = cone_lifts(vertices, faces, cones.tolist())
+    x, quadratic = tutte(faces, lift, edge_weights(vertices, faces, "uniform"), cones)
+    lattice = best_lattice(quadratic, 4.0)
+    held = np.zeros(len(vertices), dtype=bool)
+    held[cones] = True
+    mesh = scaled(vertices, faces, 2.0)
+    return mesh, faces, lift, cones, held, x, lattice
+
+
+def test_the_gradient_is_that_of_the_energy() -> None:
+    mesh, faces, lift, _, held, x, lattice = _problem()
+    quotient = Quotient(mesh, faces, lift, held)
+    uv = x @ lattice.T
+    gradient, hessian = quotient._derivatives(quotient.jacobians(uv, lattice))
+    slope = quotient._gathered(gradient)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        way = rng.normal(size=uv.shape)
+        way[held] = 0
+        h = 1e-7
+        change = quotient.energy(uv + h * way, lattice) - quotient.energy(uv - h * way, lattice)
+        assert change / (2 * h) == pytest.approx(float((slope * way).sum()), rel=1e-4)
+    assert np.linalg.eigvalsh(hessian).min() >= -1e-9 * np.abs(hessian).max()
+
+
+def test_second_derivatives_are_exact_where_they_are_positive() -> None:
+    mesh, faces, lift, _, held, _, lattice = _problem()
+    quotient = Quotient(mesh, faces, lift, held)
+    # where nothing shrinks no eigenvalue is negative
+    rng = np.random.default_rng(2)
+    j = 1.5 * np.eye(2) + 0.05 * rng.normal(size=(len(faces), 2, 2))
+    _, hessian = quotient._derivatives(j)
+    h = 1e-6
+    for k in range(3):
+        for i in range(2):
+            step = np.zeros((len(faces), 3, 2))
+            step[:, k, i] = h
+            change = np.einsum("fki,fkj->fij", step * quotient.sign[:, :, None], quotient.gradients)
+            ahead = quotient._derivatives(j + change)[0]
+            behind = quotient._derivatives(j - change)[0]
+            column = ((ahead - behind) * quotient.sign[:, :, None] / (2 * h)).reshape(-1, 6)
+            np.testing.assert_allclose(
+                hessian[:, :, 2 * k + i], column, rtol=1e-4, atol=1e-4 * np.abs(hessian).max()
+            )
+
+
+def test_the_lattices_best_shape() -> None:
+    mesh, faces, lift, _, held, x, lattice = _problem()
+    quotient = Quotient(mesh, faces, lift, held)
+    uv = x @ lattice.T
+    best = quotient.best_shape(uv, lattice)
+    assert np.linalg.det(best) == pytest.approx(1.0)
+    least = quotient.energy(uv @ best.T, best @ lattice)
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 0.1, 1.0):
+        for _ in range(10):
+            other = best + size * rng.normal(size=(2, 2))
+            if np.linalg.det(other) <= 0.01:
+                continue
+            other /= np.sqrt(np.linalg.det(other))
+            assert quotient.energy(uv @ other.T, other @ lattice) >= least - 1e-9 * least
+
+
+def test_distortion_by_the_definition() -> None:
+    vertices, faces, lift, _, _, x, lattice = _problem()
+    found = distortions(vertices, faces, lift, x, lattice)
+    corner = group.moved(lift, x[faces]) @ lattice.T
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f]]
+        u = (b - a) / np.linalg.norm(b - a)
+        n = np.cross(b - a, c - a)
+        v = np.cross(n / np.linalg.norm(n), u)
+        flat = np.array([[(b - a) @ u, (c - a) @ u], [(b - a) @ v, (c - a) @ v]])
+        p = corner[f]
+        jacobian = np.stack([p[1] - p[0], p[2] - p[0]], axis=1) @ np.linalg.inv(flat)
+        m = jacobian.T @ jacobian
+        value = np.trace(m) + np.trace(np.linalg.inv(m + 0.01 * np.eye(2)))
+        assert found[f] == pytest.approx(value, rel=1e-6)
+
+
+def test_steps_and_sweeps_lower_the_energy_and_flip_nothing() -> None:
+    mesh, faces, lift, cones, held, x, lattice = _problem(4, 60)
+    quotient = Quotient(mesh, faces, lift, held)
+    uv = x @ lattice.T
+    energies = [quotient.energy(uv, lattice)]
+    classes = list(colour_classes(mesh, faces, lift, held))
+    for _ in range(10):
+        uv, value, _ = quotient.step(uv, lattice)
+        energies.append(value)
+        for stars in classes:
+            relax(uv, lattice, stars)
+        energies.append(quotient.energy(uv, lattice))
+    assert (np.diff(energies) <= 1e-9 * energies[0]).all()
+    assert energies[-1] < 0.9 * energies[0]
+    x = np.linalg.solve(lattice, uv.T).T
+    x[cones] = group.CONES
+    assert certificate(faces, lift, x, cones).injective
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 1000))
+def test_collapses_leave_a_sphere(seed: int) -> None:
+    vertices, faces = hull(seed, 50)
+    held = np.zeros(len(vertices), dtype=bool)
+    held[:4] = True
+    coarse, rounds = collapsed(vertices, faces, held, 16)
+    a, b, c = coarse.T
+    left = coarse[(a != b) & (b != c) & (c != a)]
+    assert len(left) <= 20 and set(range(4)) <= set(left.ravel().tolist())
+    assert topology.euler_characteristic(left) == 2
+    assert (topology.edges_of(left).count == 2).all()
+    for step in reversed(rounds):  # undone, they give the mesh back
+        coarse.ravel()[step.corners] = step.vertex[step.star]
+    np.testing.assert_array_equal(coarse, faces)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000))
+def test_layouts_are_homeomorphisms_with_little_distortion(seed: int) -> None:
+    vertices, faces = hull(seed, 400)
+    cones = np.random.default_rng(seed).choice(len(vertices), 4, replace=False)
+    lift, _ = cone_lifts(vertices, faces, cones.tolist())
+    layout = laid_out(vertices, faces, lift, cones, effort=Effort(coarse=200))
+    assert torn_edges(faces, layout.lift, cones) == 0
+    x = np.linalg.solve(layout.lattice, layout.uv.T).T
+    x[cones] = group.CONES
+    assert certificate(faces, layout.lift, x, cones).injective
+    start, quadratic = tutte(faces, lift, edge_weights(vertices, faces, "mean_value"), cones)
+    before = distortions(vertices, faces, lift, start, best_lattice(quadratic, 4.0))
+    after = distortions(vertices, faces, layout.lift, x, layout.lattice)
+    area = topology.face_areas(vertices, faces)
+    assert area @ after < area @ before
+
+
+def test_long_limbs_that_tutte_squeezes_are_recovered() -> None:
+    vertices, faces, tips = limbs()
+    vertices = vertices * (1.0, 1.0, 1.0)
+    # three cones in one place: the limbs have none
+    cones = np.array([tips[0], *faces[5]])
+    lift, _ = cone_lifts(vertices, faces, cones.tolist())
+    layout = laid_out(vertices, faces, lift, cones)
+    x = np.linalg.solve(layout.lattice, layout.uv.T).T
+    x[cones] = group.CONES
+    assert certificate(faces, layout.lift, x, cones).injective
