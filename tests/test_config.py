@@ -230,6 +230,7 @@ def test_paper_settings_are_those_of_the_paper():
         ("encoding.extent=nan", "out_of_range", "encoding.extent"),
         ("encoding.degree=7", None, "encoding"),
         ("activation=sine activation.omega=0 map.initialization=siren", None, None),
+        ("logger=3", "wrong_type", None),
         ("seed=-1", "out_of_range", "seed"),
         ("seed=4294967296", "out_of_range", "seed"),
         ("data.steps_per_epoch=9223372036854775808", "out_of_range", "data.steps_per_epoch"),

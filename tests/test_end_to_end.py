@@ -51,11 +51,9 @@ def finished(tmp_path_factory) -> tuple[Path, Path, str]:
     return folder, only_run_folder(folder), result.stdout
 
 
-def test_it_prints_what_was_done_and_where_the_results_are(finished):
+def test_it_prints_where_the_results_are(finished):
     _, folder, text = finished
-    assert "cut along" in text  # the closed ball needed a seam
-    assert f"results in {folder}" in text
-    assert "RMS" in text.upper()
+    assert str(folder) in text
 
 
 def test_the_run_folder_is_complete(finished):

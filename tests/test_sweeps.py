@@ -38,7 +38,6 @@ def test_one_bad_job_and_the_same_sweep_again(tmp_path, here):
     words = ["-m", *TINY, "surface.path=patch.off,bad.off", "seed=0"]
     result = here(*words)
     assert result.returncode == 1
-    assert "2 jobs" in result.stdout and "1 complete, 1 failed" in result.stdout
     (line,) = result.stderr.splitlines()
     assert "surface.path=bad.off" in line
     first = jobs(tmp_path)
@@ -50,7 +49,6 @@ def test_one_bad_job_and_the_same_sweep_again(tmp_path, here):
     (tmp_path / "bad.off").write_text(SQUARE)
     result = here(*words)
     assert result.returncode == 0, result.stderr
-    assert "2 complete (1 of them before)" in result.stdout
     assert not (bad / "error.txt").exists()
     assert times(first) == before
 
@@ -74,8 +72,6 @@ def test_what_an_interruption_left_is_gone_on_with(tmp_path, here):
 def test_jobs_in_one_batch(tmp_path, here):
     result = here("-m", *TINY, "hydra/launcher=batched", "seed=0,1")
     assert result.returncode == 0, result.stderr
-    assert "2 in one batch" in result.stdout
-    assert "2 jobs" in result.stdout and "2 complete" in result.stdout
     told = [json.loads((place / "metrics.json").read_text()) for place in jobs(tmp_path).values()]
     assert [figures["batched"] for figures in told] == [2, 2]
 

@@ -79,12 +79,10 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("how", FAULTS.values(), ids=FAULTS.keys())
-def test_a_step_that_is_not_finite_is_taken_back(surface, tmp_path, monkeypatch, capsys, how):
+def test_a_step_that_is_not_finite_is_taken_back(surface, tmp_path, monkeypatch, how):
     spoil(monkeypatch, lambda step: step == 33, how)
     neural = run(surface, tmp_path, "scheduler=constant")
     assert told(tmp_path)["rollbacks"] == [{"step": 33, "back_to": 0}]
-    line = [x for x in capsys.readouterr().out.splitlines() if "not finite" in x]
-    assert len(line) == 1 and "step 33" in line[0]
     assert all(torch.isfinite(v).all() for v in weights(tmp_path).values())
     assert neural.metrics["rms_percent"] < 20
     rates = torch.load(tmp_path / "last.ckpt", weights_only=True)["optimizer_states"][0]
@@ -463,7 +461,7 @@ def scarce(monkeypatch, error, fits):
 
 @pytest.mark.parametrize("error", SHORTAGES.values(), ids=SHORTAGES.keys())
 def test_a_batch_that_does_not_fit_is_halved_to_the_same_result(
-    surface, tmp_path, monkeypatch, capsys, error
+    surface, tmp_path, monkeypatch, error
 ):
     few = "trainer.max_steps=10"
     run(surface, tmp_path / "whole", few)
@@ -471,7 +469,6 @@ def test_a_batch_that_does_not_fit_is_halved_to_the_same_result(
     scarce(monkeypatch, error, fits=20)
     run(surface, tmp_path / "parts", few)
     assert told(tmp_path / "parts")["batch_parts"] == 4  # 64 points in parts of 16
-    assert "batches are evaluated in 4 parts" in capsys.readouterr().out
     a, b = weights(tmp_path / "whole"), weights(tmp_path / "parts")
     for key in a:
         assert torch.allclose(a[key], b[key], rtol=1e-3, atol=1e-4), key

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -334,22 +335,22 @@ def test_closed_shapes_are_put_into_a_collection_through_their_landmarks(files):
         assert figures["landmark_error_max_percent"] < 2
 
 
-# with the file, setting or value that the line names
+# with the kind of the error, and the name of the file, surface or setting concerned
 BAD = [
-    (["landmarks=[[99999,1]]"], "99999"),
-    (["landmarks=[[1,1],[1,2]]"], "landmark"),
-    (["landmarks=[a.vts,b.vts]"], "landmark"),
-    (["landmarks=nowhere.json"], "nowhere.json"),
-    (["landmarks=broken.json"], "broken.json"),
-    (["landmarks=[[[9.0,9.0,9.0],1]]"], "landmark"),
-    (["target=null"], "target"),
-    (["target={name: spere_cap}"], "sphere_cap"),
-    (["target=ready", "domain=square"], "square"),
-    (["target=cut"], "cut"),
-    (["target=old"], "old"),
-    (["constraints.boundary=soft"], "soft"),
-    (["seam.path=sideways"], "sideways"),
-    (["attributes.source=a.vts"], "attributes.source"),
+    ("landmarks=[[99999,1]]", "out_of_range", "a"),
+    ("landmarks=[[1,1],[1,2]]", "duplicate_landmark", "a"),
+    ("landmarks=[a.vts,b.vts]", "different_lengths", "landmarks"),
+    ("landmarks=nowhere.json", "missing_file", "nowhere.json"),
+    ("landmarks=broken.json", "damaged_file", "broken.json"),
+    ("landmarks=[[[9.0,9.0,9.0],1]]", "not_on_surface", "a"),
+    ("target=null", "missing_setting", "target"),
+    ("target={name:spere_cap}", "unknown_option", "name"),
+    ("target=ready domain=square", "wrong_domain", "target"),
+    ("target=cut", "damaged_file", "surface.safetensors"),
+    ("target=old", "wrong_version", "surface.json"),
+    ("constraints.boundary=soft", "unknown_option", "constraints.boundary"),
+    ("seam.path=sideways landmarks=[[1,1],[5,5]]", "unknown_option", "seam.path"),
+    ("attributes.source=a.vts", "unreadable_file", "attributes.source"),
 ]
 
 
@@ -372,16 +373,16 @@ def bad_files(made, files, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("words", "named"), BAD, ids=[" ".join(w) for w, _ in BAD])
-def test_bad_input_is_one_line(here, bad_files, monkeypatch, words, named):
+@pytest.mark.parametrize(("words", "kind", "key"), BAD, ids=[words for words, *_ in BAD])
+def test_bad_input_is_refused(bad_files, tmp_path, monkeypatch, words, kind, key):
     monkeypatch.chdir(bad_files)
+    monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
     quick = [*QUICK, MADE, "trainer.max_steps=1", "logger=none", "trainer.progress=false"]
-    quick.append("artefacts=false")
-    if words == ["seam.path=sideways"]:
-        words = [*words, "landmarks=[[1,1],[5,5]]"]
-    run = here("task=pair_map", "source=a.obj", "target=b.obj", *quick, *words)
-    assert run.returncode == 2
-    assert named in run.stderr and len(run.stderr.strip().splitlines()) == 1, run.stderr
+    quick += ["task=pair_map", "source=a.obj", "target=b.obj", "artefacts=false"]
+    with pytest.raises(NsmError) as error:
+        run_task(compose_config([*quick, *words.split()]), tmp_path / "run")
+    assert (error.value.kind, Path(error.value.key).name) == (kind, key)
+    assert "\n" not in str(error.value)
 
 
 def test_a_collection_needs_three_surfaces(here, tmp_path):
