@@ -73,15 +73,13 @@ def prepare_jointly(
             all of them, or, with ``auto``, the number for which the domains agree best.
 
     Raises:
-        NsmError: a mesh that cannot be prepared; ``no_common_seam``.
+        NsmError: a mesh that cannot be prepared; ``wrong_topology`` if genus or number of boundary
+            loops differ; ``no_common_seam``.
     """
     domain = domain_of(domain)
     cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
-    closed = all(
-        topology.euler_characteristic(c.faces) == 2 and not topology.boundary_loops(c.faces)
-        for c in cleaned
-    )
+    closed = _common_topology(meshes, cleaned) == (0, 0)
     if not closed or len(found[0]) < 2:
         return [
             Surface.from_arrays(
@@ -122,6 +120,28 @@ def prepare_jointly(
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
     return surfaces
+
+
+def _common_topology(meshes: Sequence[Mesh], cleaned: Sequence[CleanMesh]) -> tuple[int, int]:
+    """Genus and number of boundary loops of all meshes.
+
+    Raises:
+        NsmError: ``wrong_topology``: they differ; a map would be torn.
+    """
+    found = []
+    for mesh in cleaned:
+        loops = len(topology.boundary_loops(mesh.faces))
+        found.append(((2 - topology.euler_characteristic(mesh.faces) - loops) // 2, loops))
+    for mesh, (genus, loops) in zip(meshes, found, strict=True):
+        if (genus, loops) != found[0]:
+            raise NsmError(
+                f"{mesh.name} has genus {genus} and {loops} boundary loops, {meshes[0].name} genus "
+                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes or "
+                "remove handles until they agree",
+                kind="wrong_topology",
+                key=mesh.name,
+            )
+    return found[0]
 
 
 def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:

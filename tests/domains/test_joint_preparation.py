@@ -17,6 +17,7 @@ from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_joint
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths
+from nsm.surfaces.shapes import hemisphere, torus
 
 
 def ball(subdivisions=3):
@@ -206,3 +207,13 @@ def test_the_common_seam_glues_each_branch_to_its_way_back(pair):
     first = [numbers[np.linalg.norm(keys - p, axis=1).argmin()] for p in ends[::1000, 0]]
     second = [numbers[np.linalg.norm(keys - p, axis=1).argmin()] for p in ends[::1000, 1]]
     assert first == second
+
+
+@pytest.mark.parametrize("other", ["torus", "hemisphere"])
+def test_meshes_of_another_topology_are_refused_before_any_layout(other):
+    """A sphere beside a torus (genus 1), or beside a cap (one boundary loop)."""
+    vertices, faces = {"torus": torus, "hemisphere": hemisphere}[other]()
+    meshes = [Mesh("ball", *ball(2)), Mesh(other, vertices, faces)]
+    with pytest.raises(NsmError) as error:
+        prepare_jointly(meshes, [np.arange(3), np.arange(3)], cache=False)
+    assert (error.value.kind, error.value.key) == ("wrong_topology", other)
