@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import pytorch_lightning as pl
 import torch
+import trimesh
 from hydra.core.config_store import ConfigStore
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,6 +25,7 @@ import nsm
 from nsm import api, cli, extensions
 from nsm.config import compose_config
 from nsm.domains import Surface
+from nsm.domains.planar_mesh import signed_areas
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, BLOCKS, NeuralMap, as_activation, build_analytic
@@ -522,6 +524,23 @@ def test_names_of_extensions(tables, name):
 
 
 @examples(3)
+@given(st.lists(st.floats(0.7, 1.3), min_size=12, max_size=12), st.floats(0.1, 10))
+def test_closed_surfaces_of_any_radii(radii, scale):
+    """An icosahedron with any radii is laid out injectively on the orbifold, and stays whole."""
+    mesh = trimesh.creation.icosahedron()
+    vertices, faces = scale * np.array(radii)[:, None] * mesh.vertices, np.asarray(mesh.faces)
+    surface = Surface.from_arrays(vertices, faces, domain="orbifold")
+    first, whole = surface.whole()
+    assert np.array_equal(whole, faces)
+    assert np.allclose(surface.vertices[first] / surface.scale + surface.center, vertices)
+    assert (signed_areas(surface.uv, surface.faces) > 0).all()
+    assert math.isclose(signed_areas(surface.uv, surface.faces).sum(), 2.0, rel_tol=1e-9)
+    again = Surface.from_stored(surface.name, "orbifold", surface.to_stored())
+    for name, array in surface.arrays().items():
+        assert np.array_equal(again.arrays()[name], array)
+
+
+@examples(3)
 @given(*[st.floats(0.01, 10)] * 3)
 def test_what_is_registered_is_what_is_used(tables, a, b, c):
     def target(name: str) -> str:
@@ -566,6 +585,9 @@ PROPERTIES: dict[str, list[Callable]] = {
     "Parameterization.__call__": [test_functions_of_the_domain],
     "Parameterization.repaired": [test_repaired_maps_are_certified],
     "Parameterization.save": [test_what_is_saved_is_what_is_loaded],
+    "Surface.arrays": [test_closed_surfaces_of_any_radii],
+    "Surface.from_closed": [test_closed_surfaces_of_any_radii],
+    "Surface.whole": [test_closed_surfaces_of_any_radii],
     "Surface.from_arrays": [test_surfaces_of_any_arrays, test_surfaces_of_any_few_triangles],
     "Surface.from_cut": [test_surfaces_of_any_few_triangles],
     "Surface.from_stored": [test_surfaces_of_any_few_triangles],

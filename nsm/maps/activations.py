@@ -282,10 +282,12 @@ class Elementwise(Activation):
 
 
 def _settings_of(function: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Settings that make a module of its default parameters, or a function, again."""
+    """Settings that make a module with default parameters, or a function, again; else none."""
     if isinstance(function, nn.Module):
         return {"_target_": target_of(type(function))}
-    name = getattr(function, "__name__", type(function).__name__)
+    if not hasattr(function, "__qualname__"):  # a callable object, such as a partial function
+        return {}
+    name = function.__name__
     # functions of torch that are written in C do not know their module
     target = f"torch.{name}" if getattr(torch, name, None) is function else target_of(function)
     return {"_target_": target, "_partial_": True}
