@@ -8,7 +8,7 @@ mesh, not with the fill of a factorised matrix.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -81,7 +81,7 @@ def _reinsert(
     stars = Stars.of(vertices, step.vertex, step.star, b, c)
     inner = step.before < 0
     place = np.empty((len(step.vertex), 2))
-    place[inner] = _mean_values(vertices, uv, stars)[inner]
+    place[inner] = mean_values(vertices, stars, uv[stars.b], uv[stars.c])[inner]
     place[~inner] = _between(vertices, uv, step, ~inner)
     fits = _placed(uv, stars, step, place, freedom)
     # near the target there is always room, though not in every direction
@@ -135,11 +135,18 @@ def _inwards(uv: np.ndarray, stars: Stars, step: Round, place: np.ndarray) -> np
     return np.where(step.before[:, None] < 0, at + distance[:, None] * left, place)
 
 
-def _mean_values(vertices: np.ndarray, uv: np.ndarray, stars: Stars) -> np.ndarray:
-    """The mean (N, 2) of each star's ring with mean value weights (Floater 2003)."""
+def mean_values(vertices: np.ndarray, stars: Any, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """The mean (N, 2) of each star's ring with mean value weights (Floater 2003).
+
+    Args:
+        vertices: (V, 3).
+        stars: N vertices with their triangles: ``vertex``, ``star``, ``b``, ``c`` and ``d``, as of
+            :class:`nsm.domains.vertex_relaxation.Stars`.
+        b, c: places (M, 2) of the triangles' other two corners.
+    """
     p = vertices[stars.vertex[stars.star]]
     to_b, to_c = vertices[stars.b] - p, vertices[stars.c] - p
-    lb, lc = np.linalg.norm(to_b, axis=1), np.linalg.norm(to_c, axis=1)
+    lb, lc = (np.maximum(np.linalg.norm(e, axis=1), 1e-12) for e in (to_b, to_c))
     # tan of half the angle at p; 1 / d is twice the area
     half = (1 / stars.d) / (lb * lc + (to_b * to_c).sum(axis=1)).clip(1e-300)
     half = half.clip(1e-6, 1e6)
@@ -150,7 +157,7 @@ def _mean_values(vertices: np.ndarray, uv: np.ndarray, stars: Stars) -> np.ndarr
 
     ones = np.ones(len(lb))
     weight = total(ones, ones)
-    return np.stack([total(uv[stars.b, i], uv[stars.c, i]) / weight for i in range(2)], axis=1)
+    return np.stack([total(b[:, i], c[:, i]) / weight for i in range(2)], axis=1)
 
 
 def _between(vertices: np.ndarray, uv: np.ndarray, step: Round, which: np.ndarray) -> np.ndarray:

@@ -194,7 +194,7 @@ def sweep(
         sweeps: how many times every vertex is relaxed.
     """
     ids, local = topology.renumbered(faces, len(vertices))
-    colour = _colours(local[faces], len(ids))
+    colour = colours(local[faces], len(ids))
     owner = faces.ravel()
     b, c = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
     of_corner = colour[local[owner]]
@@ -209,7 +209,7 @@ def sweep(
             relax(uv, stars, freedom)
 
 
-def _colours(faces: np.ndarray, n: int) -> np.ndarray:
+def colours(faces: np.ndarray, n: int) -> np.ndarray:
     """Numbers (N,) that differ between neighbours."""
     rings, rng = Rings(faces, n), np.random.default_rng(0)
     colour = np.full(n, -1)

@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
+from nsm.domains.coarse_to_fine import mean_values
 from nsm.domains.decimation import Round, coarsen, undo
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
@@ -292,7 +293,7 @@ def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Rou
     uv, lattice = layout.uv, layout.lattice
     b, c = stars.rings(uv, lattice)
     target = uv[step.target]
-    place = _mean_values(vertices, stars, b, c)
+    place = mean_values(vertices, stars, b, c)
     missing = _placed(uv, stars, b, c, target, place)
     for number in missing.tolist():
         mine = stars.star == number
@@ -352,21 +353,3 @@ def _innermost(b: np.ndarray, c: np.ndarray) -> np.ndarray | None:
     if not radius[best] * size >= _LEAST_ROOM:
         return None
     return middle + size * found[best, :2]
-
-
-def _mean_values(vertices: np.ndarray, stars: Stars, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The mean (N, 2) of each star's ring with mean value weights (Floater 2003)."""
-    p = vertices[stars.vertex[stars.star]]
-    to_b, to_c = vertices[stars.b] - p, vertices[stars.c] - p
-    lb, lc = (np.maximum(np.linalg.norm(e, axis=1), 1e-12) for e in (to_b, to_c))
-    # tangent of half the angle at the middle; 1 / d is twice the area
-    half = (1 / stars.d) / (lb * lc + (to_b * to_c).sum(axis=1)).clip(1e-300)
-    half = half.clip(1e-6, 1e6)
-    n = len(stars.vertex)
-
-    def total(of_b: np.ndarray, of_c: np.ndarray) -> np.ndarray:
-        return np.bincount(stars.star, weights=half * (of_b / lb + of_c / lc), minlength=n)
-
-    ones = np.ones(len(lb))
-    weight = total(ones, ones)
-    return np.stack([total(b[:, i], c[:, i]) / weight for i in range(2)], axis=1)

@@ -11,13 +11,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from nsm.domains.decimation import Rings
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.newton import hat_gradients
+from nsm.domains.vertex_relaxation import colours
 from nsm.surfaces import topology
 
 _TRIES, _SHORTER = 4, 0.35
-_COLOURS = 64
 
 
 class Stars:
@@ -147,7 +146,7 @@ def colour_classes(
 ) -> Iterator[Stars]:
     """The stars of all vertices that the faces name and that are not held, no neighbours in one."""
     ids, local = topology.renumbered(faces, len(vertices))
-    colour = _colours(local[faces], len(ids))
+    colour = colours(local[faces], len(ids))
     owner = faces.ravel()
     of_corner = np.where(held[owner], -1, colour[local[owner]])
     number = np.zeros(len(vertices), dtype=np.int64)
@@ -155,15 +154,3 @@ def colour_classes(
         corners, members = np.flatnonzero(of_corner == k), ids[(colour == k) & ~held[ids]]
         number[members] = np.arange(len(members))
         yield Stars(vertices, faces, lift, members, corners, number[owner[corners]])
-
-
-def _colours(faces: np.ndarray, n: int) -> np.ndarray:
-    """Numbers (N,) that differ between neighbours."""
-    rings, rng = Rings(faces, n), np.random.default_rng(0)
-    colour = np.full(n, -1)
-    for k in range(_COLOURS):
-        free = colour < 0
-        if not free.any():
-            break
-        colour[rings.apart(np.where(free, rng.uniform(size=n), np.inf), 1) & free] = k
-    return colour
