@@ -214,10 +214,7 @@ class Surface:
         """
         start = time.perf_counter()
         domain = domain_of(domain)
-        center = 0.5 * (cut.vertices.min(axis=0) + cut.vertices.max(axis=0))
-        centred = cut.vertices - center
-        area = float(topology.face_areas(centred, cut.faces).sum())
-        scale = float(np.sqrt(domain.area / area))
+        centred, center, scale = _centred(cut.vertices, cut.faces, domain)
         normalised = centred * scale
         flat = domain.embed(normalised, cut.faces, method=parameterization, name=name, keys=keys)
         flipped = flipped_triangles(flat.uv, cut.faces)
@@ -277,10 +274,7 @@ class Surface:
         """
         start = time.perf_counter()
         domain = domain_of(domain)
-        center = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
-        centred = mesh.vertices - center
-        area = float(topology.face_areas(centred, mesh.faces).sum())
-        scale = float(np.sqrt(domain.area / area))
+        centred, center, scale = _centred(mesh.vertices, mesh.faces, domain)
         flat = domain.embed(
             centred * scale, mesh.faces, method=parameterization, name=name, keys=cones
         )
@@ -308,7 +302,7 @@ class Surface:
             center=center,
             quality=quality,
             log=(*log, *chosen),
-            lattice=flat.lattice * np.sqrt(area * scale**2 / flat.area),
+            lattice=flat.lattice * np.sqrt(domain.area / flat.area),
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
@@ -385,6 +379,17 @@ class Surface:
                     key=self.name,
                 )
         return self.cut_vertex[np.array(numbers, dtype=np.int64)]
+
+
+def _centred(
+    vertices: np.ndarray, faces: np.ndarray, domain: Domain
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Vertices (V, 3) about the middle of their bounding box, that middle (3,), and the scale by
+    which the mesh gets the area of Ω."""
+    center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    centred = vertices - center
+    area = float(topology.face_areas(centred, faces).sum())
+    return centred, center, float(np.sqrt(domain.area / area))
 
 
 def as_it_lies(
