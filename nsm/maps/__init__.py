@@ -9,6 +9,7 @@ from nsm.maps.inverse import TransitionMap, inverted
 from nsm.maps.lattice_grid import LatticeSplineGrid
 from nsm.maps.networks import BLOCKS, NeuralMap, build_network, build_stored
 from nsm.maps.planar import DiscMap, IdentityInitializedMap, PlanarMap, SquareMap
+from nsm.maps.spline_field import SplineField
 
 __all__ = [
     "ANALYTIC",
@@ -27,6 +28,7 @@ __all__ = [
     "PointMap",
     "RandomFourierFeatures",
     "Rotated",
+    "SplineField",
     "SplineGrid",
     "SquareMap",
     "TransitionMap",
