@@ -23,9 +23,8 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     by_file_vertex,
-    checkerboard,
     distortion_picture,
-    export_mesh,
+    export_surface,
     map_image,
     morph_pictures,
     pair_metrics,
@@ -43,6 +42,7 @@ class PairMapTask(Task):
     """A map from one surface to another, with least distortion."""
 
     module, data, result, defaults = PairMap, SurfaceData, SurfaceMap, "pair_map"
+    closed_domains = True
     certified = True
     table = staticmethod(pair_table)
     picture_name = "map"
@@ -80,26 +80,32 @@ class PairMapTask(Task):
             torch.as_tensor(array, dtype=torch.float32)
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
-        if len(p):
-            rotation = landmark_rotation(self.domain, p, q)
-        else:
-            some = uv[:: len(uv) // 4096 + 1]
-            rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
-        if self.config.constraints.boundary == "penalty":
+        matrix, shift = self._start(p, q)
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
             corners = torch.from_numpy(self.domain.corners).to(p)
-            p, q = torch.cat([p, corners]), torch.cat([q, corners @ rotation.T])
+            p, q = torch.cat([p, corners]), torch.cat([q, corners @ matrix.T])
         return self.module(
             **self.map_settings(),
             points=p,
             targets=q,
             seam=seam,
-            rotation=rotation,
+            rotation=matrix,
+            shift=shift,
             mesh=(uv, torch.as_tensor(source.faces)),
             diagonal=target.bounding_box_diagonal,
             phi=self.phi.map,
             psi=self.psi.map,
         )
+
+    def _start(self, p: torch.Tensor, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The linear or affine map that h starts from, by landmarks p, q (L, 2) or distortion."""
+        if not self.domain.has_boundary:
+            return torch.eye(2), torch.zeros(2)
+        if len(p):
+            return landmark_rotation(self.domain, p, q), None
+        some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()
+        return least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some), None
 
     def make_result(self, module: Any) -> SurfaceMap:
         ids = np.stack(self.ids, axis=1)
@@ -127,17 +133,17 @@ class PairMapTask(Task):
         image = f.target.in_original_units(f.image)
         np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))
         meshes = {
-            "mapped": (image, s.faces, s.uv),
-            "target_with_source_uv": (f.target.in_original_units(t.vertices), t.faces, f.source_uv),
-            "source_with_target_uv": (f.source.in_original_units(s.vertices), s.faces, f.image_uv),
+            "mapped": (image, s, s.uv),
+            "target_with_source_uv": (f.target.in_original_units(t.vertices), t, f.source_uv),
+            "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
         for name, mesh in meshes.items():
-            export_mesh(folder / f"{name}.obj", *mesh)
-            export_mesh(folder / f"{name}.glb", *mesh, texture=checkerboard())
+            for ending in (".obj", ".glb"):
+                export_surface(folder / f"{name}{ending}", *mesh)
         (folder / "morph").mkdir(exist_ok=True)
         for k in range(_MORPH_FRAMES):
-            vertices = f.morph(k / (_MORPH_FRAMES - 1))
-            export_mesh(folder / "morph" / f"{k:02d}.obj", vertices, s.faces, s.uv)
+            frame = f.morph(k / (_MORPH_FRAMES - 1))
+            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)

@@ -6,7 +6,7 @@ from nsm.results.collection import SurfaceCollection, collection_metrics, load_c
 from nsm.results.collection_pictures import figures_picture, transfer_matrix_picture
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
-from nsm.results.meshes import export_mesh
+from nsm.results.meshes import export_mesh, export_surface
 from nsm.results.metrics import overfit_metrics, pointwise_metrics, vertex_error
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.pair_pictures import (
@@ -52,6 +52,7 @@ __all__ = [
     "comparison_table",
     "error_picture",
     "export_mesh",
+    "export_surface",
     "layout_image",
     "load_parameterization",
     "load_surface",

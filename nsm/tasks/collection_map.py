@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Rotated, batched
+from nsm.maps import batched, placed
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
@@ -39,10 +39,12 @@ class CollectionMap(ConstrainedMap):
         points: (K, 2) landmarks in the common domain.
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
-        rotations: (k, 2, 2), of the inputs.
+        rotations: (k, 2, 2), of the inputs; on a closed domain the matrices B of the maps' start
+            x ↦ Bx + c (see :class:`nsm.maps.LatticeAligned`).
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
+        shifts: c (k, 2), on a closed domain only.
 
     Raises:
         ValueError: a constraint that is not known.
@@ -68,18 +70,22 @@ class CollectionMap(ConstrainedMap):
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
+        shifts: Tensor | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
         given = ["domain", "energy", "phis", "points", "targets", "seam", "rotations", "mesh"]
-        self.save_hyperparameters(ignore=given, logger=False)
+        self.save_hyperparameters(ignore=[*given, "shifts"], logger=False)
         onto = domain if self.exact else None
+        moves = [None] * len(rotations) if shifts is None else list(shifts)
         self.map = nn.ModuleList(
-            Rotated(planar_map(onto, map, activation, encoding), rotation) for rotation in rotations
+            placed(planar_map(onto, map, activation, encoding), rotation, shift)
+            for rotation, shift in zip(rotations, moves, strict=True)
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
         margin = self.constraints.fold_margin
         self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh, margin=margin) for _ in phis)
-        self.set_landmarks(points, targets, points @ rotations.transpose(1, 2), seam)
+        start = torch.stack([h.before(points) for h in self.map])  # type: ignore[operator]
+        self.set_landmarks(points, targets, start, seam)
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])

@@ -34,27 +34,86 @@ def lifted_near(
     return best
 
 
-def triangles_over_domain(corners: np.ndarray, symmetric: bool) -> tuple[np.ndarray, np.ndarray]:
-    """All lifts of triangles (F, 3, 2) that meet the fundamental domain: (K, 3, 2), faces (K,)."""
+def triangles_over_domain(
+    corners: np.ndarray, symmetric: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All lifts of triangles (F, 3, 2) that meet the fundamental domain.
+
+    Returns:
+        the lifts (K, 3, 2), their faces (K,), and the elements (K, 3) of the group that move each
+        face there.
+    """
+    _, home = group.into_domain(corners.mean(axis=1) / SIDE, symmetric)
+    corners = SIDE * group.moved(home[:, None], corners / SIDE)
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
-    parts, numbers = [], []
+    parts, numbers, elements = [], [], []
     for sign, m, n in product((1, -1) if symmetric else (1,), (-1, 0, 1), (-1, 0, 1)):
         moved = sign * corners + SIDE * np.array([m, n])
         meets = (moved.max(axis=1) >= low).all(axis=1) & (moved.min(axis=1) <= 1.0).all(axis=1)
         parts.append(moved[meets])
         numbers.append(np.flatnonzero(meets))
-    return np.concatenate(parts), np.concatenate(numbers)
+        elements.append(group.compose(np.array([sign, m, n]), home[meets]))
+    return np.concatenate(parts), np.concatenate(numbers), np.concatenate(elements)
 
 
 def located(embedding: Embedding, points: np.ndarray) -> Places:
     """Where points (N, 2) of Ω, in any lift, lie on the mesh: faces and barycentric weights."""
-    return located_on(embedding.corners(), points, embedding.cones is not None)
+    return located_on(embedding.corners(), points, embedding.cones is not None)[0]
 
 
-def located_on(corners: np.ndarray, points: np.ndarray, symmetric: bool) -> Places:
-    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift near the domain."""
-    x, _ = group.into_domain(points / SIDE, symmetric)
-    corners, number = triangles_over_domain(corners, symmetric)
+def located_on(
+    corners: np.ndarray, points: np.ndarray, symmetric: bool
+) -> tuple[Places, np.ndarray]:
+    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift; and the elements
+    (N, 3) of the group that move each point's triangle to where the point is."""
+    x, back = group.into_domain(points / SIDE, symmetric)
+    corners, number, element = triangles_over_domain(corners, symmetric)
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     found = locate(SIDE * x, corners.reshape(-1, 2), faces)
-    return Places(number[found.face], found.weights)
+    there = group.compose(group.inverse(back), element[found.face])
+    return Places(number[found.face], found.weights), there
+
+
+def carried(
+    points: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    faces: np.ndarray,
+    copies: np.ndarray,
+    symmetric: bool,
+) -> np.ndarray:
+    """Images (N, 2), in the cover, of points (N, 2) under an equivariant map linear on triangles.
+
+    Args:
+        points: in any lift.
+        before, after: (V, 2) the vertices and their images.
+        faces: (F, 3), each triangle in one lift.
+        copies: (T, 2) vertices that are lifts of one point.
+        symmetric: whether x and -x are one point: the orbifold.
+    """
+    places, element = located_on(before[faces], points, symmetric)
+    value = places.take(after, faces)
+    matrix, shift = _affine_part(before, after, copies)
+    sign, moves = element[:, :1], element[:, 1:] * SIDE
+    # h(γx) = γ'h(x): for γ = (x ↦ sx + k), γ' is y ↦ sy + Bk + (1 - s)c
+    return sign * value + moves @ matrix.T + (1 - sign) * shift
+
+
+def _affine_part(
+    before: np.ndarray, after: np.ndarray, copies: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """B (2, 2) and c (2,) for which an equivariant map is x ↦ Bx + c but for a function of Ω.
+
+    Two lifts a and b = sa + k of a point have images with h(b) = sh(a) + Bk + (1 - s)c.
+    """
+    if not len(copies):
+        return np.eye(2), np.zeros(2)
+    a, b = before[copies[:, 0]], before[copies[:, 1]]
+    turned = np.abs((a + b) / SIDE - np.rint((a + b) / SIDE)).max(axis=1) < 1e-9
+    straight = np.abs((b - a) / SIDE - np.rint((b - a) / SIDE)).max(axis=1) < 1e-9
+    sign = np.where(turned & ~straight, -1.0, 1.0)[:, None]
+    rows = np.concatenate([b - sign * a, 1 - sign], axis=1)
+    values = after[copies[:, 1]] - sign * after[copies[:, 0]]
+    solution = np.linalg.lstsq(rows, values, rcond=1e-9)[0]
+    # without a turned pair c is not asked for; integers but for rounding otherwise
+    return np.rint(solution[:2].T), np.rint(solution[2])
