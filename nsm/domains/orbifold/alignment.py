@@ -164,9 +164,7 @@ def _candidates(source: Surface, target: Surface) -> list[np.ndarray]:
     one, other = source.lattice @ bases[0], target.lattice @ bases[1]
     entries = np.arange(-_ENTRIES, _ENTRIES + 1)
     column = np.stack(np.meshgrid(entries, entries, indexing="ij"), axis=-1).reshape(-1, 2)
-    first, second = (
-        i.ravel() for i in np.meshgrid(*[np.arange(len(column))] * 2, indexing="ij")
-    )
+    first, second = (i.ravel() for i in np.meshgrid(*[np.arange(len(column))] * 2, indexing="ij"))
     a, b = column[first], column[second]
     unit = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] == 1
     matrix = np.stack([a[unit], b[unit]], axis=2)
@@ -270,7 +268,5 @@ def _symmetric_dirichlet(rest: np.ndarray, image: np.ndarray) -> np.ndarray:
         inverse = 1 / (e * g - f * f)
         trace = (g * h - 2 * f * m + e * n) * inverse
         determinant = (h * n - m * m) * inverse
-        value = trace + (trace + 2 * _EPSILON) / (
-            determinant + _EPSILON * trace + _EPSILON**2
-        )
+        value = trace + (trace + 2 * _EPSILON) / (determinant + _EPSILON * trace + _EPSILON**2)
     return np.where(np.isfinite(value) & (value > 0), value, _WORST).clip(1.0, _WORST)
