@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -15,7 +15,8 @@ from nsm.domains.orbifold.cones import LARGE, compared, decimated
 from nsm.domains.orbifold.embedding import reduced_basis
 from nsm.surfaces import topology
 
-_CANDIDATES = 7  # landmarks, of which all sets of four are compared
+_CANDIDATES = 10  # landmarks
+_SETS = 6  # sets of four that are laid out
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -25,8 +26,9 @@ def choose_common_cones(
 ) -> tuple[np.ndarray, float]:
     """Four landmarks that, as cones of all surfaces, make domains of little distortion.
 
-    The candidates are landmarks that are far from each other on all surfaces. The order is the one
-    for which the lattices are least sheared.
+    The candidates are landmarks that are far from each other on all surfaces. Of all their sets of
+    four, those are laid out for which the product of the six distances is largest. The order is
+    the one for which the lattices are least sheared.
 
     Args:
         meshes: vertices (V, 3) and faces (F, 3) of closed meshes of genus 0.
@@ -37,14 +39,18 @@ def choose_common_cones(
         over the surfaces of the mean logarithm of the distortion.
     """
     kept = distinct(landmarks)
-    chosen = kept[far_apart(meshes, [ids[kept] for ids in landmarks], _CANDIDATES)]
+    places, distances = far_apart(meshes, [ids[kept] for ids in landmarks], _CANDIDATES)
+    chosen = kept[places]
+    closeness = -np.log(distances + np.eye(len(chosen)))
+    sets = [np.array(four) for four in combinations(range(len(chosen)), 4)]
+    sets.sort(key=lambda four: float(closeness[np.ix_(four, four)].sum()))
     own = [ids[chosen] for ids in landmarks]
     smaller = list(meshes)
     for k, (vertices, faces) in enumerate(meshes):
         if len(faces) > LARGE:
             coarse, ids = decimated(vertices, faces, LARGE // 2, own[k])
             smaller[k], own[k] = (vertices[ids], coarse), np.searchsorted(ids, own[k])
-    score, four, lattices = compared(smaller, own)[0]
+    score, four, lattices = compared(smaller, own, sets[:_SETS])[0]
     return chosen[four[_least_sheared(lattices)]], score
 
 
@@ -57,9 +63,13 @@ def distinct(landmarks: Sequence[np.ndarray]) -> np.ndarray:
     return np.flatnonzero(keep)
 
 
-def far_apart(meshes: Sequence[Mesh], landmarks: Sequence[np.ndarray], count: int) -> np.ndarray:
-    """Numbers of up to ``count`` landmarks, ascending: farthest points, by the sum over the meshes
-    of their distances along edges in the unit of √area."""
+def far_apart(
+    meshes: Sequence[Mesh], landmarks: Sequence[np.ndarray], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (K,) of up to ``count`` landmarks, farthest points, and their distances (K, K).
+
+    Distances are along edges, in the unit of √area, summed over the meshes.
+    """
     graphs = []
     for vertices, faces in meshes:
         unit = np.sqrt(topology.face_areas(vertices, faces).sum())
@@ -77,11 +87,11 @@ def far_apart(meshes: Sequence[Mesh], landmarks: Sequence[np.ndarray], count: in
         )
 
     chosen = [int(distance(0).argmax())]
-    nearest = distance(chosen[0])
+    rows = [distance(chosen[0])]
     while len(chosen) < min(count, len(landmarks[0])):
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, distance(chosen[-1]))
-    return np.sort(np.array(chosen))
+        chosen.append(int(np.min(rows, axis=0).argmax()))
+        rows.append(distance(chosen[-1]))
+    return np.array(chosen), np.stack(rows)[:, chosen]
 
 
 def _least_sheared(lattices: Sequence[np.ndarray]) -> np.ndarray:

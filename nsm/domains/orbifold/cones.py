@@ -131,28 +131,29 @@ def choose_cones(
         if len(candidates) < 4:
             candidates = _four_apart(vertices, faces, candidates)
     candidates = np.asarray(candidates, dtype=np.int64)
-    table = [
-        (s, tuple(candidates[four].tolist()))
-        for s, four, _ in compared([(vertices, faces)], [candidates])
-    ]
+    sets = [np.array(four) for four in combinations(range(len(candidates)), 4)]
+    found = compared([(vertices, faces)], [candidates], sets)
+    table = [(s, tuple(candidates[four].tolist())) for s, four, _ in found]
     return np.array(table[0][1]), table
 
 
 def compared(
-    meshes: Sequence[tuple[np.ndarray, np.ndarray]], candidates: Sequence[np.ndarray]
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]],
+    candidates: Sequence[np.ndarray],
+    sets: Sequence[np.ndarray],
 ) -> list[tuple[float, np.ndarray, list[np.ndarray]]]:
-    """Sets of four of the candidates, by the mean of the meshes' scores, best first.
+    """Sets of four candidates, by the mean of the meshes' scores, best first.
 
     All are laid out on a few hundred faces; those returned, the best, again on about 3,000.
 
     Args:
         meshes: (V, 3) and (F, 3) of each.
         candidates: (K,) corresponding vertices of each.
+        sets: which candidates (4,) each has.
 
     Returns:
-        of each set the mean score, which candidates (4,) it has, and the meshes' lattices (2, 2).
+        of each set the mean score, the set, and the meshes' lattices (2, 2).
     """
-    sets = [np.array(four) for four in combinations(range(len(candidates[0])), 4)]
     few, many = (_FEW, _QUICK), (_FACES, _LONGER)
     found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
     for count, effort in (few, many) if len(sets) > 1 else (few,):
@@ -173,7 +174,7 @@ def _scored(
     vertices: np.ndarray,
     faces: np.ndarray,
     candidates: np.ndarray,
-    sets: list[np.ndarray],
+    sets: Sequence[np.ndarray],
     count: int,
     effort: Effort,
 ) -> list[tuple[float, np.ndarray]]:
