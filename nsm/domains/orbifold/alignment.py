@@ -34,7 +34,9 @@ _SHIFTS = 8  # per axis, of a torus without landmarks
 _HALVINGS = 4  # of the step between them, around the best
 _EPSILON = 0.01  # METHOD Eq. 2
 _WORST = 1e3  # upper bound on a triangle's distortion
-_MISS = 1.0  # weight of the landmarks' distances beside the logarithm of the distortion
+# weight of the landmarks' distances, in the unit in which a disc of Ω's area has the radius 1,
+# beside the logarithm of the distortion
+_MISS = 3.0
 
 
 @dataclass(frozen=True)

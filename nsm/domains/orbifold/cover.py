@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from nsm.domains.orbifold import group
-from nsm.domains.orbifold.embedding import SIDE, Embedding
+from nsm.domains.orbifold.embedding import SIDE, Embedding, reduced_basis
 from nsm.surfaces.location import Places, locate
 
 
@@ -22,12 +22,14 @@ def lifted_near(
         lattice: (2, 2) of an embedding, by whose plane distances are measured; of Ω if not given.
     """
     shape = np.eye(2) if lattice is None else lattice / SIDE
+    basis = reduced_basis(shape)  # in another the nearest lift may be far from the rounded one
+    back = np.rint(np.linalg.inv(basis))
     best = np.empty_like(points, dtype=np.float64)
     least = np.full(len(points), np.inf)
     for sign in (1, -1) if symmetric else (1,):
-        first = sign * points + SIDE * np.rint((near - sign * points) / SIDE)
+        first = np.rint((near - sign * points) @ back.T / SIDE)
         for shift in product((-1, 0, 1), repeat=2):
-            lift = first + SIDE * np.array(shift)
+            lift = sign * points + SIDE * ((first + np.array(shift)) @ basis.T)
             distance = np.linalg.norm((lift - near) @ shape.T, axis=1)
             closer = distance < least
             best[closer], least[closer] = lift[closer], distance[closer]
@@ -38,11 +40,15 @@ def triangles_over_domain(corners: np.ndarray, symmetric: bool) -> tuple[np.ndar
     """All lifts of triangles (F, 3, 2) that meet the fundamental domain: (K, 3, 2), faces (K,)."""
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
     parts, numbers = [], []
-    for sign, m, n in product((1, -1) if symmetric else (1,), (-1, 0, 1), (-1, 0, 1)):
-        moved = sign * corners + SIDE * np.array([m, n])
-        meets = (moved.max(axis=1) >= low).all(axis=1) & (moved.min(axis=1) <= 1.0).all(axis=1)
-        parts.append(moved[meets])
-        numbers.append(np.flatnonzero(meets))
+    for sign in (1, -1) if symmetric else (1,):
+        least, most = (sign * corners).min(axis=1), (sign * corners).max(axis=1)
+        first = np.ceil((low - most.max(axis=0)) / SIDE).astype(int)
+        last = np.floor((1.0 - least.min(axis=0)) / SIDE).astype(int)
+        for shift in product(*(range(a, b + 1) for a, b in zip(first, last, strict=True))):
+            by = SIDE * np.array(shift)
+            meets = (most + by >= low).all(axis=1) & (least + by <= 1.0).all(axis=1)
+            parts.append(sign * corners[meets] + by)
+            numbers.append(np.flatnonzero(meets))
     return np.concatenate(parts), np.concatenate(numbers)
 
 
