@@ -11,6 +11,7 @@ import torch
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.orbifold.alignment import alignments
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
@@ -66,6 +67,11 @@ class PairMapTask(Task):
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
+        if not self.domain.has_boundary:
+            common = (ids[0], ids[1]) if len(ids[0]) else None
+            self.alignments = alignments(phi.surface, psi.surface, common)
+            for one in self.alignments[:3]:
+                self.console.print(str(one.matrix.tolist()), one.shift, one.score)
 
     @property
     def title(self) -> str:
@@ -101,7 +107,9 @@ class PairMapTask(Task):
     def _start(self, p: torch.Tensor, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The linear or affine map that h starts from, by landmarks p, q (L, 2) or distortion."""
         if not self.domain.has_boundary:
-            return torch.eye(2), torch.zeros(2)
+            best = self.alignments[0]
+            matrix, shift = (torch.as_tensor(x).float() for x in (best.matrix, best.shift))
+            return matrix, shift
         if len(p):
             return landmark_rotation(self.domain, p, q), None
         some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()

@@ -7,7 +7,8 @@ from itertools import product
 import numpy as np
 
 from nsm.domains.orbifold import group
-from nsm.domains.orbifold.embedding import SIDE, Embedding
+from nsm.domains.orbifold.embedding import SIDE, Embedding, reduced_basis
+from nsm.domains.orbifold.repair import isotopy_class
 from nsm.surfaces.location import Places, locate
 
 
@@ -22,12 +23,14 @@ def lifted_near(
         lattice: (2, 2) of an embedding, by whose plane distances are measured; of Ω if not given.
     """
     shape = np.eye(2) if lattice is None else lattice / SIDE
+    basis = reduced_basis(shape)  # in another the nearest lift may be far from the rounded one
+    back = np.rint(np.linalg.inv(basis))
     best = np.empty_like(points, dtype=np.float64)
     least = np.full(len(points), np.inf)
     for sign in (1, -1) if symmetric else (1,):
-        first = sign * points + SIDE * np.rint((near - sign * points) / SIDE)
+        first = np.rint((near - sign * points) @ back.T / SIDE)
         for shift in product((-1, 0, 1), repeat=2):
-            lift = first + SIDE * np.array(shift)
+            lift = sign * points + SIDE * ((first + np.array(shift)) @ basis.T)
             distance = np.linalg.norm((lift - near) @ shape.T, axis=1)
             closer = distance < least
             best[closer], least[closer] = lift[closer], distance[closer]
@@ -47,12 +50,16 @@ def triangles_over_domain(
     corners = SIDE * group.moved(home[:, None], corners / SIDE)
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
     parts, numbers, elements = [], [], []
-    for sign, m, n in product((1, -1) if symmetric else (1,), (-1, 0, 1), (-1, 0, 1)):
-        moved = sign * corners + SIDE * np.array([m, n])
-        meets = (moved.max(axis=1) >= low).all(axis=1) & (moved.min(axis=1) <= 1.0).all(axis=1)
-        parts.append(moved[meets])
-        numbers.append(np.flatnonzero(meets))
-        elements.append(group.compose(np.array([sign, m, n]), home[meets]))
+    for sign in (1, -1) if symmetric else (1,):
+        least, most = (sign * corners).min(axis=1), (sign * corners).max(axis=1)
+        first = np.ceil((low - most.max(axis=0)) / SIDE).astype(int)
+        last = np.floor((1.0 - least.min(axis=0)) / SIDE).astype(int)
+        for shift in product(*(range(a, b + 1) for a, b in zip(first, last, strict=True))):
+            by = SIDE * np.array(shift)
+            meets = (most + by >= low).all(axis=1) & (least + by <= 1.0).all(axis=1)
+            parts.append(sign * corners[meets] + by)
+            numbers.append(np.flatnonzero(meets))
+            elements.append(group.compose(np.array([sign, *shift]), home[meets]))
     return np.concatenate(parts), np.concatenate(numbers), np.concatenate(elements)
 
 
@@ -93,27 +100,7 @@ def carried(
     """
     places, element = located_on(before[faces], points, symmetric)
     value = places.take(after, faces)
-    matrix, shift = _affine_part(before, after, copies)
+    matrix, shift = isotopy_class(before, copies, after, symmetric)
     sign, moves = element[:, :1], element[:, 1:] * SIDE
     # h(γx) = γ'h(x): for γ = (x ↦ sx + k), γ' is y ↦ sy + Bk + (1 - s)c
     return sign * value + moves @ matrix.T + (1 - sign) * shift
-
-
-def _affine_part(
-    before: np.ndarray, after: np.ndarray, copies: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """B (2, 2) and c (2,) for which an equivariant map is x ↦ Bx + c but for a function of Ω.
-
-    Two lifts a and b = sa + k of a point have images with h(b) = sh(a) + Bk + (1 - s)c.
-    """
-    if not len(copies):
-        return np.eye(2), np.zeros(2)
-    a, b = before[copies[:, 0]], before[copies[:, 1]]
-    turned = np.abs((a + b) / SIDE - np.rint((a + b) / SIDE)).max(axis=1) < 1e-9
-    straight = np.abs((b - a) / SIDE - np.rint((b - a) / SIDE)).max(axis=1) < 1e-9
-    sign = np.where(turned & ~straight, -1.0, 1.0)[:, None]
-    rows = np.concatenate([b - sign * a, 1 - sign], axis=1)
-    values = after[copies[:, 1]] - sign * after[copies[:, 0]]
-    solution = np.linalg.lstsq(rows, values, rcond=1e-9)[0]
-    # without a turned pair c is not asked for; integers but for rounding otherwise
-    return np.rint(solution[:2].T), np.rint(solution[2])
