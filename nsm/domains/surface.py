@@ -340,7 +340,7 @@ class Surface:
         return first, number.reshape(-1)[self.faces]
 
     def at(self, uv: np.ndarray) -> np.ndarray:
-        """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω, of any lift."""
+        """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
         return self.domain.locate(uv, self.uv, self.faces).take(self.vertices, self.faces)
 
     @property

@@ -3,7 +3,7 @@
 from nsm.maps.activations import Activation, as_activation
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Formula, build_analytic
 from nsm.maps.batched_maps import batched
-from nsm.maps.composition import Composition, LatticeAligned, PointMap, Rotated, placed
+from nsm.maps.composition import Composition, LatticeAligned, PointMap, Rotated
 from nsm.maps.encodings import Encoding, Identity, RandomFourierFeatures, SplineGrid
 from nsm.maps.equivariant import EquivariantMap, TorusMap
 from nsm.maps.inverse import TransitionMap, inverted
@@ -40,5 +40,4 @@ __all__ = [
     "build_network",
     "build_stored",
     "inverted",
-    "placed",
 ]

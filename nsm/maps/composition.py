@@ -64,6 +64,10 @@ class Rotated(nn.Module):
         self.inner = inner
         self.register_buffer("rotation", rotation.detach().clone())
 
+    def around(self, inner: nn.Module) -> Rotated:
+        """The same rotation of another map's input."""
+        return Rotated(inner, self.rotation)
+
     @classmethod
     def all_of(cls, turned: Sequence[Rotated], inner: nn.Module) -> Rotated:
         """k such maps as one of points (k, N, 2), around a batch of their inner maps."""
@@ -122,6 +126,10 @@ class LatticeAligned(nn.Module):
         self.register_buffer("matrix", matrix.detach().clone())
         self.register_buffer("shift", shift.detach().clone())
 
+    def around(self, inner: nn.Module) -> LatticeAligned:
+        """The same affine map of another map's input."""
+        return LatticeAligned(inner, self.matrix, self.shift)
+
     @classmethod
     def all_of(cls, aligned: Sequence[LatticeAligned], inner: nn.Module) -> LatticeAligned:
         """k such maps as one of points (k, N, 2), around a batch of their inner maps."""
@@ -138,9 +146,7 @@ class LatticeAligned(nn.Module):
 
     def back(self, x: Tensor) -> Tensor:
         """B⁻¹ (x - c): the inverse of :meth:`before`."""
-        (a, b), (c, d) = self.matrix.unbind(-1)[0].unbind(-1), self.matrix.unbind(-1)[1].unbind(-1)
-        adjugate = torch.stack([torch.stack([d, -c], -1), torch.stack([-b, a], -1)], -2)
-        return (x - self.shift.unsqueeze(-2)) @ adjugate.mT
+        return (x - self.shift.unsqueeze(-2)) @ torch.linalg.inv(self.matrix).round().mT
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, n)."""
@@ -150,10 +156,3 @@ class LatticeAligned(nn.Module):
         """(N, 2) to the values (N, n) and Jacobians J_inner(B x + c)·B, (N, n, 2)."""
         value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self.before(x))
         return value, jacobian @ self.matrix.unsqueeze(-3)
-
-
-def placed(
-    inner: nn.Module, matrix: Tensor, shift: Tensor | None = None
-) -> Rotated | LatticeAligned:
-    """x ↦ inner(M x), or inner(M x + c) on a closed domain."""
-    return Rotated(inner, matrix) if shift is None else LatticeAligned(inner, matrix, shift)

@@ -12,6 +12,7 @@ import torch
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
 from nsm.domains.orbifold.alignment import alignments
+from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
@@ -34,7 +35,7 @@ from nsm.results import (
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import PairMap
-from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
 
 _MORPH_FRAMES = 9
 
@@ -86,34 +87,34 @@ class PairMapTask(Task):
             torch.as_tensor(array, dtype=torch.float32)
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
-        matrix, shift = self._start(p, q)
+        start = self._start(p, q)
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
             corners = torch.from_numpy(self.domain.corners).to(p)
-            p, q = torch.cat([p, corners]), torch.cat([q, corners @ matrix.T])
+            p, q = torch.cat([p, corners]), torch.cat([q, start.before(corners)])
         return self.module(
             **self.map_settings(),
             points=p,
             targets=q,
             seam=seam,
-            rotation=matrix,
-            shift=shift,
+            start=start,
             mesh=(uv, torch.as_tensor(source.faces)),
             diagonal=target.bounding_box_diagonal,
             phi=self.phi.map,
             psi=self.psi.map,
         )
 
-    def _start(self, p: torch.Tensor, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The linear or affine map that h starts from, by landmarks p, q (L, 2) or distortion."""
+    def _start(self, p: torch.Tensor, q: torch.Tensor) -> Rotated | LatticeAligned:
+        """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)
+        or by distortion."""
         if not self.domain.has_boundary:
-            best = self.alignments[0]
-            matrix, shift = (torch.as_tensor(x).float() for x in (best.matrix, best.shift))
-            return matrix, shift
+            return aligned(self.alignments[0])
         if len(p):
-            return landmark_rotation(self.domain, p, q), None
-        some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()
-        return least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some), None
+            rotation = landmark_rotation(self.domain, p, q)
+        else:
+            some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()
+            rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
+        return Rotated(torch.nn.Identity(), rotation)
 
     def make_result(self, module: Any) -> SurfaceMap:
         ids = np.stack(self.ids, axis=1)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
@@ -24,7 +24,6 @@ from nsm.results.metrics import evaluate
 from nsm.results.networks import placed_map
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.surface_map import SurfaceMap
-from nsm.surfaces.location import locate
 
 FORMAT = "nsm-collection"
 STEM = "collection"

@@ -18,7 +18,6 @@ from nsm.maps import (
     Rotated,
     build_analytic,
     build_stored,
-    placed,
 )
 
 
@@ -70,9 +69,9 @@ def placed_map(
     network = network_of(config, inner, trust)
     own = {key: v for key, v in tensors.items() if not key.startswith("inner.")}
     if set(own) == {"rotation"}:
-        whole = placed(network, own["rotation"])
+        whole: Rotated | LatticeAligned = Rotated(network, own["rotation"])
     elif set(own) == {"matrix", "shift"}:
-        whole = placed(network, own["matrix"], own["shift"])
+        whole = LatticeAligned(network, own["matrix"], own["shift"])
     else:
         raise ValueError(f"neither a rotation nor an affine map: {', '.join(own)}"[:200])
     return whole.eval().requires_grad_(False)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import batched, placed
+from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
@@ -39,12 +39,11 @@ class CollectionMap(ConstrainedMap):
         points: (K, 2) landmarks in the common domain.
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
-        rotations: (k, 2, 2), of the inputs; on a closed domain the matrices B of the maps' start
-            x ↦ Bx + c (see :class:`nsm.maps.LatticeAligned`).
+        starts: where each h_i starts, a rotation or, on a closed domain, an affine map: maps around
+            the identity.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
-        shifts: c (k, 2), on a closed domain only.
 
     Raises:
         ValueError: a constraint that is not known.
@@ -65,21 +64,18 @@ class CollectionMap(ConstrainedMap):
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
-        rotations: Tensor,
+        starts: Sequence[Rotated | LatticeAligned],
         mesh: tuple[Tensor, Tensor],
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
-        shifts: Tensor | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phis", "points", "targets", "seam", "rotations", "mesh"]
-        self.save_hyperparameters(ignore=[*given, "shifts"], logger=False)
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh"]
+        self.save_hyperparameters(ignore=given, logger=False)
         onto = domain if self.exact else None
-        moves = [None] * len(rotations) if shifts is None else list(shifts)
         self.map = nn.ModuleList(
-            placed(planar_map(onto, map, activation, encoding), rotation, shift)
-            for rotation, shift in zip(rotations, moves, strict=True)
+            start.around(planar_map(onto, map, activation, encoding)) for start in starts
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
         margin = self.constraints.fold_margin

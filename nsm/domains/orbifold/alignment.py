@@ -11,7 +11,7 @@ Primer on Mapping Class Groups", sections 2.2.4 and 2.2.5).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -65,6 +65,12 @@ class Alignment:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """B x + c at points (N, 2) of Ω."""
         return points @ self.matrix.T + self.shift
+
+    @property
+    def inverse(self) -> Alignment:
+        """The map back, x ↦ B⁻¹(x - c), with the same figures."""
+        back = np.rint(np.linalg.inv(self.matrix)).astype(np.int64)
+        return replace(self, matrix=back, shift=-back @ self.shift)
 
     def lifted(self, points: np.ndarray, targets: np.ndarray, target: Surface) -> np.ndarray:
         """Of the lifts of target points (L, 2) those (L, 2) nearest to the images of points (L, 2).

@@ -10,7 +10,8 @@ from domains.orbifold.shapes import limbs, torus
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.cover import lifted_near, located, triangles_over_domain
 from nsm.domains.orbifold.embedding import Embedding, embed_orbifold, embed_torus, twisted
-from nsm.domains.orbifold.maps import EquivariantMap, PeriodicSplineGrid, TorusMap
+from nsm.domains.orbifold.maps import PeriodicSplineGrid
+from nsm.maps import EquivariantMap, LatticeAligned, TorusMap
 
 
 @pytest.fixture(scope="module", params=["orbifold", "torus"])
@@ -86,17 +87,22 @@ def test_lifts_cover_the_domain(embedding: Embedding) -> None:
     assert area >= (2 if embedding.cones is not None else 4)
 
 
+def _twisted(displacement: torch.nn.Module) -> LatticeAligned:
+    matrix = torch.tensor([[2.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+    return LatticeAligned(TorusMap.around(displacement), matrix, torch.zeros(2).double())
+
+
 def test_small_equivariant_maps_are_certified(embedding: Embedding) -> None:
     torch.manual_seed(0)
     displacement = PeriodicSplineGrid([4], 2, scale=0.02).double()
     if embedding.cones is not None:
         maps: list[tuple[torch.nn.Module, np.ndarray | None]] = [
-            (EquivariantMap(displacement), None)
+            (EquivariantMap.around(displacement), None)
         ]
     else:
         maps = [
-            (TorusMap(displacement), None),
-            (TorusMap(displacement, ((2, 1), (1, 1))), np.array([[2, 1], [1, 1]])),
+            (TorusMap.around(displacement), None),
+            (_twisted(displacement), np.array([[2, 1], [1, 1]])),
         ]
     for h, matrix in maps:
         with torch.no_grad():
