@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytorch_lightning as pl
 import torch
+from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
 from nsm.domains.joint_preparation import Matched, matched_landmarks
@@ -28,6 +29,7 @@ from nsm.results import (
     figures_picture,
     map_image,
     transfer_matrix_picture,
+    warning_of_tears,
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import CollectionMap
@@ -160,6 +162,10 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+
+    def warnings(self, result: SurfaceCollection) -> list[Text]:
+        every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
+        return [torn for torn in every if torn is not None]
 
     def figures(self, result: SurfaceCollection) -> dict[str, Any]:
         names = [phi.surface.name for phi in self.phis]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.text import Text
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
@@ -32,6 +33,7 @@ from nsm.results import (
     pair_metrics,
     pair_table,
     transfer_picture,
+    warning_of_tears,
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import PairMap
@@ -126,6 +128,11 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+
+    def warnings(self, result: SurfaceMap) -> list[Text]:
+        name = f"{self.surface.name} → {self.psi.surface.name}"
+        torn = warning_of_tears(name, result.metrics)
+        return [] if torn is None else [torn]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
         return {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}

@@ -24,7 +24,13 @@ from nsm.results.pictures import (
     reconstruction_image,
 )
 from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map, on_cut_mesh
-from nsm.results.tables import collection_table, comparison_table, metrics_table, pair_table
+from nsm.results.tables import (
+    collection_table,
+    comparison_table,
+    metrics_table,
+    pair_table,
+    warning_of_tears,
+)
 from nsm.results.textures import checkerboard
 
 __all__ = [
@@ -44,6 +50,7 @@ __all__ = [
     "pair_metrics",
     "pair_table",
     "transfer_picture",
+    "warning_of_tears",
     "NeuralSurface",
     "Parameterization",
     "atomic_write",
