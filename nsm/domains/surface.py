@@ -281,7 +281,7 @@ class Surface:
         origin, uv, faces = flat.copies()
         first = first_copies(origin, len(mesh.vertices))
         quality = {
-            "flipped_triangles": 0.0,
+            "flipped_triangles": float(flipped_triangles(uv, faces)),
             "median_symmetric_dirichlet": float(np.median(flat.distortions(centred))),
             "seconds": time.perf_counter() - start,
         }
