@@ -155,6 +155,10 @@ def finish(
         result = task.make_result(module)
     task.measure(result)
     task.save(run.folder, result)
+    if task.table is not None:
+        task.console.print(task.table(result.metrics))
+    for warning in task.warnings(result):
+        task.console.print(warning, soft_wrap=True)
     if task.config.artefacts:
         task.write_artefacts(run.folder, result)
     ensemble = trainer.lightning_module
@@ -173,10 +177,6 @@ def finish(
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
-    if task.table is not None:
-        task.console.print(task.table(result.metrics))
-    for warning in task.warnings(result):
-        task.console.print(warning, soft_wrap=True)
     if not is_temporary(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result
