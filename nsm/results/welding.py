@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from nsm.domains import Surface
+from nsm.surfaces.cutting import chords_joined
 from nsm.surfaces.location import Places, locate
 
 _SWEEPS = 20
@@ -27,7 +28,8 @@ class Weld:
     Attributes:
         places: (V,) on the target's faces.
         points: (V, 3) in the target's normalised units.
-        faces: (F, 3) the source mesh before it was cut, by vertices of its file.
+        corners: (F, 3) the triangles of the source before points were inserted, by its vertices.
+        faces: (F, 3) the same before the mesh was cut, by vertices of its file.
         flipped_triangles: of those at the seam, how many are turned against the target: their
             normal and the mean of the target's normals at their corners make no sharp angle.
         largest_move: of a copy's image, in the target's normalised units.
@@ -35,6 +37,7 @@ class Weld:
 
     places: Places = field(repr=False)
     points: np.ndarray = field(repr=False)
+    corners: np.ndarray = field(repr=False)
     faces: np.ndarray = field(repr=False)
     flipped_triangles: int
     largest_move: float
@@ -48,7 +51,8 @@ def weld(source: Surface, target: Surface, places: Places, kept: Sequence[int] =
         places: (V,) where the map sends the source's vertices, on the target's faces.
         kept: vertices of the source, such as landmarks, whose other copies go to their image.
     """
-    faces, rejoined = _without_inserted(source)
+    corners, rejoined = chords_joined(source.faces, source.source_vertex < 0)
+    faces = source.source_vertex[corners]
     ids, first, number, count = np.unique(
         source.source_vertex, return_index=True, return_inverse=True, return_counts=True
     )
@@ -70,30 +74,7 @@ def weld(source: Surface, target: Surface, places: Places, kept: Sequence[int] =
     points = np.where(single[:, None], before, image.points[number])
     moves = np.linalg.norm(points - before, axis=1)
     flips = int((image.heights(judged) <= 0).sum())
-    return Weld(Places(face, weights), points, faces, flips, float(moves.max(initial=0.0)))
-
-
-def _without_inserted(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """The faces (F, 3) of a mesh before it was cut, by vertices of its file.
-
-    Points that were inserted in the middle of edges are taken out again.
-
-    Returns:
-        the faces, and a mask (F,) of those that are in pieces on the surface.
-    """
-    into = np.arange(len(surface.vertices))
-    own = surface.source_vertex >= 0
-    for m in np.flatnonzero(~own).tolist():
-        around = np.unique(surface.faces[(surface.faces == m).any(axis=1)])
-        around = around[own[around]]
-        a, b = np.triu_indices(len(around), 1)
-        p = surface.vertices[around]
-        off = np.linalg.norm(0.5 * (p[a] + p[b]) - surface.vertices[m], axis=1)
-        into[m] = around[a[off.argmin()]]
-    faces = into[surface.faces]
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    in_pieces = ~own[surface.faces].all(axis=1)
-    return surface.source_vertex[faces[whole]], in_pieces[whole]
+    return Weld(Places(face, weights), points, corners, faces, flips, float(moves.max(initial=0.0)))
 
 
 class _Image:
@@ -151,8 +132,8 @@ def _to_middles(
         movable: (K,) mask of vertices.
     """
     count = np.bincount(number, minlength=len(movable))
-    mean = np.stack([np.bincount(number, x, len(movable)) for x in before.T], axis=1)
-    mean = mean / count[:, None]
+    total = np.stack([np.bincount(number, x, len(movable)) for x in before.T], axis=1)
+    mean = total / count[:, None]
     which = np.flatnonzero(movable)
     if not len(which):
         return
@@ -225,7 +206,8 @@ def _best(image: _Image, vertex: int, star: np.ndarray, places: Places) -> bool:
 def _kernel(image: _Image, vertex: int, star: np.ndarray) -> np.ndarray:
     """The point (3,) of the tangent plane at a vertex that is deepest inside the lines through the
     opposite sides of its triangles (S, 3): its star's kernel, if there is one."""
-    at, normal = image.points[vertex], image.normals[vertex]
+    at: np.ndarray = image.points[vertex]
+    normal: np.ndarray = image.normals[vertex]
     least = int(np.abs(normal).argmin())
     u = _unit(np.cross(normal, np.eye(3)[least])[None])[0]
     axes = np.stack([u, np.cross(normal, u)])
