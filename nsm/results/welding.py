@@ -42,8 +42,17 @@ class Weld:
     flipped_triangles: int
     largest_move: float
 
+    def figures(self, diagonal: float) -> dict[str, float]:
+        """welded_flipped_triangles, and welded_move_max_percent of the target's diagonal."""
+        return {
+            "welded_flipped_triangles": self.flipped_triangles,
+            "welded_move_max_percent": 100 * self.largest_move / diagonal,
+        }
 
-def weld(source: Surface, target: Surface, places: Places, kept: Sequence[int] = ()) -> Weld:
+
+def weld(
+    source: Surface, target: Surface, places: Places, kept: Sequence[int] | np.ndarray = ()
+) -> Weld:
     """Weld the seam of a mapped surface.
 
     Args:
