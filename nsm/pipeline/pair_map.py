@@ -25,8 +25,8 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
-    by_file_vertex,
     distortion_picture,
+    export_mesh,
     export_surface,
     map_image,
     morph_pictures,
@@ -128,6 +128,8 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        if len(source.seam_pairs) and source.domain.has_boundary:
+            result.metrics.update(result.weld.figures(target.bounding_box_diagonal))
 
     def warnings(self, result: SurfaceMap) -> list[Text]:
         name = f"{self.surface.name} → {self.psi.surface.name}"
@@ -146,10 +148,8 @@ class PairMapTask(Task):
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
-        image = f.target.in_original_units(f.image)
-        np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))
+        _write_image(folder, f)
         meshes = {
-            "mapped": (image, s, s.uv),
             "target_with_source_uv": (f.target.in_original_units(t.vertices), t, f.source_uv),
             "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
@@ -163,3 +163,16 @@ class PairMapTask(Task):
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_image(folder: Path, f: SurfaceMap) -> None:
+    """The source's mesh on the target, welded: a closed one is closed."""
+    s, weld = f.source.surface, f.weld
+    image = f.target.in_original_units(f.welded_image)
+    np.save(folder / "mapped_vertices.npy", image)
+    points = f.target.in_original_units(weld.points)
+    export_surface(folder / "mapped.glb", points, s, s.uv)
+    if s.domain.has_boundary:
+        export_mesh(folder / "mapped.obj", image, weld.faces, s.uv, corners=weld.corners)
+    else:
+        export_surface(folder / "mapped.obj", points, s, s.uv)

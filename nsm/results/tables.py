@@ -63,6 +63,8 @@ _PAIR_ROWS = {
     "covered_percent": ("target covered", "% of area"),
     "seam_gap_mean_percent": ("gap across the seam, mean", "% of diagonal"),
     "seam_gap_max_percent": ("gap across the seam, largest", "% of diagonal"),
+    "welded_flipped_triangles": ("triangles turned over by the weld", ""),
+    "welded_move_max_percent": ("way of the weld, largest", "% of diagonal"),
 }
 
 
