@@ -71,6 +71,7 @@ def run_task(
     with process_state():
         task = make_task(config, Console(highlight=False, markup=False))
         check_packages(config.logger)
+        task.choose_domain(given or Given())
         task.prepare(given or Given())
         return run_prepared(task, Run(config, folder, resuming), started)
 
