@@ -48,7 +48,7 @@ torture: .venv/.nsm-dev
 # Fuzz each reader of files for FUZZ_SECONDS; test each property on FUZZ_EXAMPLES times the examples
 # of the tests.
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks surface map pair collection checkpoint
+FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks picked barycentric surface map pair collection checkpoint
 FUZZ_EXAMPLES ?= 20
 fuzz: .venv/.nsm-dev
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[fuzz]'

@@ -390,9 +390,10 @@ class Settings:
         target: the same; or an analytic surface: a name (sphere_cap, plane, ...) or
             '{name: graph, z: 0.3*u*v}'.
         surfaces: of task=collection_map: three surfaces or more, each as source.
-        landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned or .json, one for
-            each surface; or pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z] stands for
-            the vertex nearest to it.
+        landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned, .bary, .pp or
+            .json, one for each surface, or the names of meshes of the catalogue that have some; or
+            pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
+            b2] with barycentric coordinates, stands for the vertex nearest to it.
         loss_terms: your own terms: +loss_terms.mine._target_=mypackage.MyTerm
             +loss_terms.mine.weight=0.1.
         callbacks: Lightning callbacks: +callbacks.mine._target_=mypackage.MyCallback.

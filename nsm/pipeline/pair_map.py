@@ -56,7 +56,7 @@ class PairMapTask(Task):
             for key, end in (("source", given.source), ("target", given.target))
         ]
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes)
+        ids = landmark_vertices(landmarks, shapes, self.console)
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
