@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-closed bench-activation bench-speed bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-closed bench-correspondence bench-activation bench-speed bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -36,6 +36,11 @@ bench-maps: .venv/.nsm-dev
 # Closed surfaces on the disc and on the orbifold, default settings: ten minutes. MESHES as above.
 bench-closed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/closed_surfaces.py $(if $(MESHES),--meshes $(MESHES))
+
+# Correspondences without landmarks, errors at annotated ones: an hour, or EVERY=5. MESHES as above.
+bench-correspondence: .venv/.nsm-dev
+	$(BIN)/python benchmarks/correspondence.py $(if $(MESHES),--meshes $(MESHES)) \
+	  $(if $(EVERY),--every $(EVERY))
 
 # One network with each activation, its wrinkles, and a report on the runs: half an hour.
 bench-activation: .venv/.nsm-dev

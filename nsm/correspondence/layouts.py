@@ -57,6 +57,12 @@ class Table:
     vertex: np.ndarray
     log_metric: np.ndarray
 
+    def near(self, points: np.ndarray) -> np.ndarray:
+        """Vertices (...) near points (..., 2) of Ω, in any lift."""
+        n = len(self.vertex)
+        i, j = np.moveaxis(np.mod(np.rint(0.5 * n * points).astype(np.int64), n), -1, 0)
+        return np.asarray(self.vertex[i, j])
+
 
 def quick_scores(shape: CoarseShape) -> tuple[np.ndarray, np.ndarray]:
     """All sets (S, 4) of four tips, and the mean log distortion (S,) of Tutte's embedding of each.
@@ -65,7 +71,10 @@ def quick_scores(shape: CoarseShape) -> tuple[np.ndarray, np.ndarray]:
     """
     sets = np.array(list(combinations(range(len(shape.tips)), 4)))
     vertices, faces = shape.vertices, shape.faces
-    weights, area = edge_weights(vertices, faces, "mean_value"), topology.face_areas(vertices, faces)
+    weights, area = (
+        edge_weights(vertices, faces, "mean_value"),
+        topology.face_areas(vertices, faces),
+    )
     scores = []
     for four in sets:
         cones = shape.tips[four]
