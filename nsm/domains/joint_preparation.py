@@ -22,6 +22,7 @@ from nsm.domains.disc import Disc
 from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
+from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
@@ -59,9 +60,10 @@ def prepare_jointly(
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
-    Closed genus-0 meshes with two landmarks or more are cut along corresponding seams, and the
-    landmarks on the seam get the same places on ∂Ω in all of them. Other meshes are prepared one
-    by one.
+    For a domain with boundary, closed genus-0 meshes with two landmarks or more are cut along
+    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. On
+    the orbifold, meshes with four landmarks or more get the same four as their cones, those whose
+    domains are least distorted in the mean. Other meshes are prepared one by one.
 
     Args:
         meshes: two or more.
@@ -79,8 +81,8 @@ def prepare_jointly(
     domain = domain_of(domain)
     cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
-    closed = _common_topology(meshes, cleaned) == (0, 0)
-    if not closed or len(found[0]) < 2:
+    enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
+    if _common_topology(meshes, cleaned) != (0, 0) or not enough:
         return [
             Surface.from_arrays(
                 m.vertices,
@@ -113,13 +115,41 @@ def prepare_jointly(
                 for m, s in zip(meshes, stored, strict=True)
                 if s is not None
             ]
-    surfaces = _cut_and_embed(
-        meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
-    )
+    if domain.has_boundary:
+        surfaces = _cut_and_embed(
+            meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
+        )
+    else:
+        surfaces = _with_common_cones(meshes, cleaned, found, domain, parameterization)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
     return surfaces
+
+
+def _with_common_cones(
+    meshes: Sequence[Mesh],
+    cleaned: Sequence[CleanMesh],
+    landmarks: Sequence[np.ndarray],
+    domain: Domain,
+    method: str,
+) -> list[Surface]:
+    numbers, score = choose_common_cones([(c.vertices, c.faces) for c in cleaned], landmarks)
+    line = (
+        f"cones at landmarks {numbers.tolist()}, counted from 0, the same on all meshes: mean log "
+        f"distortion {score:.3f}"
+    )
+    return [
+        Surface.from_closed(
+            c,
+            name=m.name,
+            domain=domain,
+            parameterization=method,
+            cones=ids[numbers].tolist(),
+            log=(*m.log, *c.log, line),
+        )
+        for m, c, ids in zip(meshes, cleaned, landmarks, strict=True)
+    ]
 
 
 def _common_topology(meshes: Sequence[Mesh], cleaned: Sequence[CleanMesh]) -> tuple[int, int]:
@@ -357,7 +387,7 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
     """Corresponding points in the domains of surfaces.
 
     A landmark on the seam has several preimages on ∂Ω; they correspond in the order in which the
-    boundary passes them.
+    boundary passes them. On a closed domain each has one, in one of its lifts.
 
     Args:
         surfaces: all of one domain.
@@ -366,6 +396,9 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
     Raises:
         NsmError: a landmark that a surface does not have, or boundaries that do not correspond.
     """
+    if not surfaces[0].domain.has_boundary:
+        points = [s.preimages(ids.tolist()) for s, ids in zip(surfaces, landmarks, strict=True)]
+        return Matched(points, np.arange(len(landmarks[0])), 0)
     keys = [
         boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], s.kept(ids.tolist()))
         for s, ids in zip(surfaces, landmarks, strict=True)

@@ -339,6 +339,10 @@ class Surface:
         _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
 
+    def at(self, uv: np.ndarray) -> np.ndarray:
+        """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
+        return self.domain.locate(uv, self.uv, self.faces).take(self.vertices, self.faces)
+
     @property
     def bounding_box_diagonal(self) -> float:
         """Length of the bounding box's diagonal, in normalised units."""
