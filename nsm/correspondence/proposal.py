@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsm.correspondence.coarse_shape import coarse_shape
+from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.search import Candidate, candidates, distance_change, rigid_residual
 
 _DISTANCES, _RIGID = 2.0, 1.0  # weights beside the logarithm of the energy
 _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which they are two
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
+_AROUND = 0.3  # a tip's neighbourhood, over √area
 _LEAST_MARGIN = 0.15
 _LARGEST_SCORE = 2.6
 
@@ -90,8 +91,8 @@ def _matched_tips(candidate: Candidate) -> np.ndarray:
     """Vertices (L, 2) of the coarse shapes: cones, and tips whose images are mutually nearest."""
     source, target = candidate.source.shape, candidate.target.shape
     pairs = candidate.cones()
-    ours = np.setdiff1d(source.tips, pairs[:, 0])
-    theirs = np.setdiff1d(target.tips, pairs[:, 1])
+    ours = np.setdiff1d(_peaks(source), pairs[:, 0])
+    theirs = np.setdiff1d(_peaks(target), pairs[:, 1])
     if len(ours) and len(theirs):
         apart = target.distance[np.ix_(candidate.images(ours), theirs)]
         nearest = apart.argmin(axis=1)
@@ -99,6 +100,13 @@ def _matched_tips(candidate: Candidate) -> np.ndarray:
         mutual = (apart.argmin(axis=0)[nearest] == rows) & (apart[rows, nearest] < _NEAR)
         pairs = np.concatenate([pairs, np.stack([ours, theirs[nearest]], axis=1)[mutual]])
     return pairs
+
+
+def _peaks(shape: CoarseShape) -> np.ndarray:
+    """The tips from which the mean distance falls all around; others lie between limbs."""
+    around = shape.distance[shape.tips] < _AROUND
+    height = np.where(around, shape.mean_distance, 0.0).max(axis=1)
+    return shape.tips[shape.mean_distance[shape.tips] >= height]
 
 
 def _apart(first: Hypothesis, second: Hypothesis) -> float:
