@@ -9,13 +9,13 @@ import numpy as np
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.search import Candidate, candidates, distance_change, rigid_residual
 
-_DISTANCES, _RIGID = 2.0, 1.0  # weights beside the logarithm of the energy
+_DISTANCES, _RIGID = 4.0, 2.0  # weights beside the logarithm of the energy
 _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which they are two
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
 _AROUND = 0.3  # a tip's neighbourhood, over √area
 _LEAST_MARGIN = 0.15
-_LARGEST_SCORE = 2.6
+_LARGEST_ENERGY = 10.0
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Hypothesis:
     Attributes:
         vertices: (L, 2) corresponding vertices of source and target: the four at the cones of the
             orbifold, then other tips that the map brings near to each other.
-        score: log energy + 2 distance_change + rigid_residual; lower is better.
+        score: log energy + 4 distance_change + 2 rigid_residual; lower is better.
         energy: mean symmetric Dirichlet energy of the coarse map; 4 at isometry.
         distance_change: mean change of geodesic distances, over √area.
         rigid_residual: root mean square distance after the best rigid motion, over √area.
@@ -55,7 +55,7 @@ class Proposal:
     @property
     def sure(self) -> bool:
         """Whether the first is far ahead of the second, and good in itself."""
-        return self.margin > _LEAST_MARGIN and self.hypotheses[0].score < _LARGEST_SCORE
+        return self.margin > _LEAST_MARGIN and self.hypotheses[0].energy < _LARGEST_ENERGY
 
 
 def proposed(

@@ -2,6 +2,7 @@
 
 from nsm.maps.activations import Activation, as_activation
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Formula, build_analytic
+from nsm.maps.analytic_closed import ClosedAnalyticSurface
 from nsm.maps.batched_maps import batched
 from nsm.maps.composition import Composition, LatticeAligned, PointMap, Rotated
 from nsm.maps.encodings import Encoding, Identity, RandomFourierFeatures, SplineGrid
@@ -16,6 +17,7 @@ __all__ = [
     "BLOCKS",
     "Activation",
     "AnalyticSurface",
+    "ClosedAnalyticSurface",
     "Composition",
     "DiscMap",
     "Encoding",

@@ -241,13 +241,17 @@ class _Pair:
         return np.mod(shift + 1, SIDE) - 1
 
     def best_shifts(self, matrices: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Matrices with translations of a torus for which the distortion is least."""
+        """Matrices with translations of a torus for which the distortion is least nearby."""
         step = SIDE / _SHIFTS
         grid = -1 + step * np.array(list(product(range(_SHIFTS), repeat=2)))
-        found = [self.alignment(b, c, _FEW) for b in matrices for c in grid]
-        found = sorted(found, key=lambda a: a.score)[:_FINALISTS]
-        result = []
-        for best in found:
+        found: list[Alignment] = []
+        for matrix in matrices:
+            every = [self.alignment(matrix, c, _FEW) for c in grid]
+            score = np.array([a.score for a in every]).reshape(_SHIFTS, _SHIFTS)
+            around = [np.roll(score, d, axis=(0, 1)) for d in product((-1, 0, 1), repeat=2)]
+            found += [every[k] for k in np.flatnonzero(score <= np.min(around, axis=0))]
+        result: list[tuple[np.ndarray, np.ndarray]] = []
+        for best in sorted(found, key=lambda a: a.score)[:_FINALISTS]:
             width = step
             for _ in range(_HALVINGS):
                 width /= 2

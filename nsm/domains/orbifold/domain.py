@@ -22,11 +22,11 @@ from nsm.domains.base import Domain
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.cover import carried, located_on
 from nsm.domains.orbifold.embedding import SIDE, Embedding, embed_orbifold, embed_torus
+from nsm.domains.orbifold.quotient_mesh import quotient_mesh
 from nsm.domains.orbifold.repair import copied, repaired, torn
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.location import Places
-from nsm.surfaces.shapes import grid_mesh
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -171,9 +171,22 @@ class ClosedDomain(Domain):
 
     def mesh(self, rings: int = 60) -> tuple[np.ndarray, np.ndarray]:
         """A grid of points (V, 2) of the fundamental domain, and triangles (F, 3)."""
-        points, faces = grid_mesh(2 * rings)
-        low = np.array(self.low)
-        return low + (1 - low) * 0.5 * (points + 1), faces
+        return self.closed_mesh(rings)[:2]
+
+    def closed_mesh(
+        self, rings: int = 60, lattice: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As :meth:`mesh`, and the vertex (V,) that each point is a copy of.
+
+        Args:
+            rings: there are about (2 rings)² cells.
+            lattice: (2, 2), in whose plane cells are nearly square; square by default.
+        """
+        across, along = (1.0, 1.0) if lattice is None else np.linalg.norm(lattice, axis=0)
+        halves = 2 if self.even else 1
+        columns = 2 * rings * math.sqrt(halves * across / along)
+        rows = 2 * rings * math.sqrt(along / across / halves)
+        return quotient_mesh(columns, rows, self.even)
 
     def encoding(
         self,
