@@ -18,13 +18,14 @@ from nsm.maps import ANALYTIC
 from nsm.pipeline.configured_surface import report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
-<<<<<<< HEAD
-from nsm.surfaces.catalogue import catalogue_landmarks, catalogue_mesh, has_landmarks
-from nsm.surfaces.landmark_files import Marks, read_collection, read_marks, read_pairs
-=======
 from nsm.results.analytic import lies_over
-from nsm.surfaces.catalogue import catalogue_mesh, catalogue_names
->>>>>>> main
+from nsm.surfaces.catalogue import (
+    catalogue_landmarks,
+    catalogue_mesh,
+    catalogue_names,
+    has_landmarks,
+)
+from nsm.surfaces.landmark_files import Marks, read_collection, read_marks, read_pairs
 from nsm.surfaces.landmarks import (
     AtVertices,
     Landmarks,

@@ -110,7 +110,9 @@ def read_names(path: str | Path) -> list[str] | None:
     return list(names)
 
 
-def to_json(lists: Sequence[Sequence[Any]], names: Sequence[str] | None, **more: Any) -> str:
+def to_json(
+    lists: Sequence[Sequence[Any] | np.ndarray], names: Sequence[str] | None, **more: Any
+) -> str:
     """The text of a file that :func:`read_pairs` or :func:`read_collection` reads.
 
     Args:
