@@ -70,7 +70,7 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes)
+        ids = landmark_vertices(landmarks, shapes, self.console)
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:

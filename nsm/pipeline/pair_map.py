@@ -15,6 +15,7 @@ from nsm.domains.joint_preparation import matched_landmarks
 from nsm.domains.orbifold.alignment import alignments
 from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.proposed_landmarks import AUTO, ProposedLandmarks, propose_landmarks
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
     neural_surfaces,
@@ -51,6 +52,7 @@ class PairMapTask(Task):
     table = staticmethod(pair_table)
     picture_name = "map"
     attributes: dict[str, np.ndarray]
+    proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         ends = (("source", given.source), ("target", given.target))
@@ -64,7 +66,11 @@ class PairMapTask(Task):
             for key, end in (("source", given.source), ("target", given.target))
         ]
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes)
+        self.proposed = None
+        if isinstance(landmarks, str) and landmarks == AUTO:
+            self.proposed = propose_landmarks(shapes, **settings["proposal"], console=self.console)
+            landmarks = self.proposed.landmarks
+        ids = landmark_vertices(landmarks, shapes, self.console)
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
@@ -148,6 +154,8 @@ class PairMapTask(Task):
 
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
