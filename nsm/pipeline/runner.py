@@ -13,6 +13,7 @@ from rich.console import Console
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.pipeline.certification import certified
+from nsm.pipeline.checkpoints import CHECKPOINT_FILE
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.process_state import process_state
 from nsm.pipeline.task import Given, Task
@@ -103,6 +104,11 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
     """
     module, data = built(task), task.build_data()
     trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
+    while task.begin_again(module):
+        # first this, then the new settings: a run that is killed between does the same again
+        (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+        module, data = built(task), task.build_data()
+        trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
     return finish(task, run, module, trainer, started, data=data)
 
 

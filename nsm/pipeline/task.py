@@ -188,6 +188,13 @@ class Task:
         )
         return data
 
+    def begin_again(self, module: Any) -> bool:
+        """Whether a trained module shows that another start is needed; the settings then have it.
+
+        The task says so. A run that is resumed begins with the start in its settings.
+        """
+        return False
+
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""
         raise NotImplementedError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from domains.orbifold.shapes import limbs, torus
 
 import nsm
 from nsm.domains import Surface
+from nsm.domains.orbifold.alignment import alignments
+from nsm.errors import NsmError
 from nsm.results.metrics import evaluate
 
 QUICK = [
@@ -193,3 +196,36 @@ def test_collections_are_certified_and_their_cycles_close(shapes, tmp_path, doma
     again = nsm.load(folder)
     points = third.triangles_center
     np.testing.assert_allclose(again.pair(0, 2)(points), g.pair(0, 2)(points), atol=1e-6)
+
+
+def test_a_wrong_isotopy_class_is_noticed_and_the_next_is_tried(shapes, tmp_path, monkeypatch):
+    """The right class is second to a Dehn twist of it."""
+    from nsm.pipeline import pair_map
+
+    def with_the_twist_first(*arguments):
+        found = alignments(*arguments)
+        twist = np.array([[1, 2], [0, 1]])
+        return [replace(found[0], matrix=found[0].matrix @ twist), *found]
+
+    monkeypatch.setattr(pair_map, "alignments", with_the_twist_first)
+    files, marks = shapes["orbifold"]
+    overrides = ["domain=orbifold", *QUICK, MADE, "artefacts=false"]
+    f = nsm.map_pair(
+        *files,
+        [[v, v] for v in marks],
+        overrides=overrides,
+        folder=tmp_path / "run",
+        progress=False,
+    )
+    assert f.certificate["certified"] and f.metrics["symmetric_dirichlet_median"] < 5
+    summary = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert summary["isotopy_class"] == 1 and len(summary["isotopy_classes"]) > 1
+    assert f.config["isotopy_class"] == 1
+
+
+def test_a_class_that_is_not_there_is_refused(shapes):
+    files, marks = shapes["orbifold"]
+    overrides = ["domain=orbifold", *QUICK, MADE, "isotopy_class=500"]
+    with pytest.raises(NsmError) as error:
+        nsm.map_pair(*files, [[v, v] for v in marks], overrides=overrides, progress=False)
+    assert (error.value.kind, error.value.key) == ("out_of_range", "isotopy_class")
