@@ -52,6 +52,10 @@ class CollectionMapTask(Task):
     table = staticmethod(collection_table)
     picture_name = "map"
 
+    def inputs(self, given: Given) -> list[Any]:
+        surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
+        return list(surfaces) if isinstance(surfaces, (list, tuple)) else []
+
     def prepare(self, given: Given) -> None:
         self.keep_absolute("surfaces", "landmarks")
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces

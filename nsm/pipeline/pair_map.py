@@ -52,6 +52,10 @@ class PairMapTask(Task):
     picture_name = "map"
     attributes: dict[str, np.ndarray]
 
+    def inputs(self, given: Given) -> list[Any]:
+        ends = (("source", given.source), ("target", given.target))
+        return [self.settings[key] if end is None else end for key, end in ends]
+
     def prepare(self, given: Given) -> None:
         self.keep_absolute("source", "target", "landmarks", "attributes")
         settings = self.settings
