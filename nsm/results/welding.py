@@ -30,8 +30,8 @@ class Weld:
         points: (V, 3) in the target's normalised units.
         corners: (F, 3) the triangles of the source before points were inserted, by its vertices.
         faces: (F, 3) the same before the mesh was cut, by vertices of its file.
-        flipped_triangles: of those at the seam, how many are turned against the target: their
-            normal and the mean of the target's normals at their corners make no sharp angle.
+        flipped_triangles: how many the weld turned against the target: their normal and the mean
+            of the target's normals at their corners made a sharp angle before, but do not now.
         largest_move: of a copy's image, in the target's normalised units.
     """
 
@@ -75,14 +75,16 @@ def weld(
     movable[number[held]] = False
     _to_middles(image, places, before, number, movable)
     compact = np.searchsorted(ids, faces)
-    judged = compact[on_seam[compact].any(axis=1) | rejoined]
-    _relax(image, judged, movable, places, number)
+    judged = on_seam[compact].any(axis=1) | rejoined
+    judged &= _Image(target, places).heights(corners) > 0
+    compact = compact[judged]
+    _relax(image, compact, movable, places, number)
     single = source.source_vertex < 0  # points inserted between vertices have no copies
     face = np.where(single, places.face, image.places.face[number])
     weights = np.where(single[:, None], places.weights, image.places.weights[number])
     points = np.where(single[:, None], before, image.points[number])
     moves = np.linalg.norm(points - before, axis=1)
-    flips = int((image.heights(judged) <= 0).sum())
+    flips = int((image.heights(compact) <= 0).sum())
     return Weld(Places(face, weights), points, corners, faces, flips, float(moves.max(initial=0.0)))
 
 
@@ -165,10 +167,10 @@ def _to_middles(
 def _relax(
     image: _Image, faces: np.ndarray, movable: np.ndarray, places: Places, number: np.ndarray
 ) -> None:
-    """Move vertices of turned triangles to where fewer of theirs are turned, or less.
+    """Move vertices of turned triangles to where fewer of theirs are turned.
 
     Args:
-        faces: (F, 3) all triangles at the vertices that may move.
+        faces: (F, 3) triangles that should not be turned, all those at the vertices that may move.
         movable: (K,) mask of them.
         places: (V,) the copies' images, and number: (V,) the vertex of each.
     """
@@ -192,8 +194,8 @@ def _relax(
 
 
 def _best(image: _Image, vertex: int, star: np.ndarray, places: Places) -> bool:
-    """Move a vertex to the best of places (N,) for its triangles (S, 3), or leave it; whether it
-    moved."""
+    """Move a vertex to the place, of (N,), where fewest of its triangles (S, 3) are turned, or
+    leave it if none is better; whether it moved."""
 
     def score() -> tuple[int, float]:
         heights = image.heights(star)
@@ -206,10 +208,10 @@ def _best(image: _Image, vertex: int, star: np.ndarray, places: Places) -> bool:
     for k in range(len(places.face)):
         trial = Places(places.face[[k]], places.weights[[k]])
         image.move(here, trial)
-        if score() > value:
+        if score() > value and score()[0] > start[0]:
             best, value = trial, score()
     image.move(here, best)
-    return value > start
+    return value[0] > start[0]
 
 
 def _kernel(image: _Image, vertex: int, star: np.ndarray) -> np.ndarray:

@@ -100,7 +100,7 @@ def test_what_is_together_stays(name):
     np.testing.assert_allclose(welded.points, places.take(target.vertices, target.faces), atol=1e-9)
 
 
-@given(st.integers(0, 2**32 - 1), names, st.floats(0.01, 0.25))
+@given(st.integers(0, 2**32 - 1), names, st.floats(0.01, 0.08))
 @examples(25)
 def test_copies_meet_on_the_target_and_nothing_else_moves(seed, name, share):
     source, target = PAIRS[name]
@@ -135,8 +135,10 @@ def test_gaps_of_half_an_edge_are_relaxed(seed, name):
     middle = np.stack([np.bincount(number, x * (source.source_vertex >= 0)) for x in before.T], 1)
     middle /= count[:, None]
     at = by_file(source, source.vertices)
-    naive = int(turned(middle, welded.faces, at).sum())
-    after = int(turned(by_file(source, welded.points), welded.faces, at).sum())
+    sides = [before, source.vertices], [middle, at], [by_file(source, welded.points), at]
+    faces = (welded.corners, welded.faces, welded.faces)
+    torn, naive, after = (turned(p, f, q) for (p, q), f in zip(sides, faces, strict=True))
+    naive, after = (int((x & ~torn).sum()) for x in (naive, after))
     assert welded.flipped_triangles <= max(2, naive // 4) and after <= max(3, naive // 3)
 
 
@@ -155,12 +157,27 @@ def test_kept_vertices_draw_their_copies(name):
 
 
 def test_triangles_that_cannot_be_turned_back_are_counted():
-    """All vertices off the seam are mirrored: every triangle at the seam is turned over."""
+    """Copies three edges apart: some triangles stay turned, and a plain recount finds them."""
     source, target = PAIRS["limbs"]
-    mirrored = locate(source.vertices * [-1, 1, 1], target.vertices, target.faces)
-    welded = weld(source, target, mirrored)
-    at_seam = on_seam(source)[source.faces].any(axis=1).sum()
-    assert welded.flipped_triangles > 0.5 * at_seam
+    places = pulled_apart(source, target, np.random.default_rng(0), 3.0)
+    welded = weld(source, target, places)
+    normals = np.zeros_like(target.vertices)
+    corners = target.vertices[target.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    number = target.source_vertex
+    for v in range(number.max() + 1):
+        normals[number == v] = cross[(number[target.faces] == v).any(axis=1)].sum(axis=0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def count(p):
+        points, normal = p.take(target.vertices, target.faces), p.take(normals, target.faces)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        a, b, c = (points[welded.corners[:, k]] for k in range(3))
+        middle = normal[welded.corners].sum(axis=1)
+        return (np.cross(b - a, c - a) * middle).sum(axis=1) <= 0
+
+    new = count(welded.places) & ~count(places)
+    assert welded.flipped_triangles == new.sum() > 0
 
 
 def test_another_sheet_is_not_taken():
