@@ -281,7 +281,7 @@ class Surface:
         origin, uv, faces = flat.copies()
         first = first_copies(origin, len(mesh.vertices))
         quality = {
-            "flipped_triangles": 0.0,
+            "flipped_triangles": float(flipped_triangles(uv, faces)),
             "median_symmetric_dirichlet": float(np.median(flat.distortions(centred))),
             "seconds": time.perf_counter() - start,
         }
@@ -337,6 +337,10 @@ class Surface:
         """
         _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    def at(self, uv: np.ndarray) -> np.ndarray:
+        """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
+        return self.domain.locate(uv, self.uv, self.faces).take(self.vertices, self.faces)
 
     @property
     def bounding_box_diagonal(self) -> float:

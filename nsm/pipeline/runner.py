@@ -71,6 +71,7 @@ def run_task(
     with process_state():
         task = make_task(config, Console(highlight=False, markup=False))
         check_packages(config.logger)
+        task.choose_domain(given or Given())
         task.prepare(given or Given())
         return run_prepared(task, Run(config, folder, resuming), started)
 
@@ -155,6 +156,10 @@ def finish(
         result = task.make_result(module)
     task.measure(result)
     task.save(run.folder, result)
+    if task.table is not None:
+        task.console.print(task.table(result.metrics))
+    for warning in task.warnings(result):
+        task.console.print(warning, soft_wrap=True)
     if task.config.artefacts:
         task.write_artefacts(run.folder, result)
     ensemble = trainer.lightning_module
@@ -173,8 +178,6 @@ def finish(
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
-    if task.table is not None:
-        task.console.print(task.table(result.metrics))
     if not is_temporary(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result
