@@ -8,10 +8,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.text import Text
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.orbifold.alignment import Alignment, alignments
+from nsm.errors import NsmError
+from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.proposed_landmarks import AUTO, ProposedLandmarks, propose_landmarks
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
     neural_surfaces,
@@ -22,31 +27,42 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
-    by_file_vertex,
-    checkerboard,
     distortion_picture,
     export_mesh,
+    export_surface,
+    isotopy_table,
     map_image,
+    mean_log_distortion,
     morph_pictures,
     pair_metrics,
     pair_table,
     transfer_picture,
+    warning_of_tears,
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import PairMap
-from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
 
 _MORPH_FRAMES = 9
+_CLASSES_SHOWN, _CLASSES_TRIED = 4, 3
+# percent of the diagonal: landmarks that stay so far off are on the wrong side of a twist
+_MISSED = 1.0
 
 
 class PairMapTask(Task):
     """A map from one surface to another, with least distortion."""
 
     module, data, result, defaults = PairMap, SurfaceData, SurfaceMap, "pair_map"
+    closed_domains = True
     certified = True
     table = staticmethod(pair_table)
     picture_name = "map"
     attributes: dict[str, np.ndarray]
+    proposed: ProposedLandmarks | None = None
+
+    def inputs(self, given: Given) -> list[Any]:
+        ends = (("source", given.source), ("target", given.target))
+        return [self.settings[key] if end is None else end for key, end in ends]
 
     def prepare(self, given: Given) -> None:
         self.keep_absolute("source", "target", "landmarks", "attributes")
@@ -56,7 +72,11 @@ class PairMapTask(Task):
             for key, end in (("source", given.source), ("target", given.target))
         ]
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes)
+        self.proposed = None
+        if isinstance(landmarks, str) and landmarks == AUTO:
+            self.proposed = propose_landmarks(shapes, **settings["proposal"], console=self.console)
+            landmarks = self.proposed.landmarks
+        ids = landmark_vertices(landmarks, shapes, self.console)
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
@@ -66,6 +86,10 @@ class PairMapTask(Task):
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
+        if not self.domain.has_boundary:
+            common = (ids[0], ids[1]) if len(ids[0]) else None
+            self.alignments = alignments(phi.surface, psi.surface, common)
+            self.console.print(isotopy_table(self.alignments[:_CLASSES_SHOWN]))
 
     @property
     def title(self) -> str:
@@ -80,26 +104,74 @@ class PairMapTask(Task):
             torch.as_tensor(array, dtype=torch.float32)
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
-        if len(p):
-            rotation = landmark_rotation(self.domain, p, q)
-        else:
-            some = uv[:: len(uv) // 4096 + 1]
-            rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
-        if self.config.constraints.boundary == "penalty":
+        start = self._start(p, q)
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
             corners = torch.from_numpy(self.domain.corners).to(p)
-            p, q = torch.cat([p, corners]), torch.cat([q, corners @ rotation.T])
+            p, q = torch.cat([p, corners]), torch.cat([q, start.before(corners)])
         return self.module(
             **self.map_settings(),
             points=p,
             targets=q,
             seam=seam,
-            rotation=rotation,
+            start=start,
             mesh=(uv, torch.as_tensor(source.faces)),
             diagonal=target.bounding_box_diagonal,
             phi=self.phi.map,
             psi=self.psi.map,
         )
+
+    def _start(self, p: torch.Tensor, q: torch.Tensor) -> Rotated | LatticeAligned:
+        """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)
+        or by distortion."""
+        if not self.domain.has_boundary:
+            return aligned(self._alignment)
+        if len(p):
+            rotation = landmark_rotation(self.domain, p, q)
+        else:
+            some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()
+            rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
+        return Rotated(torch.nn.Identity(), rotation)
+
+    @property
+    def _alignment(self) -> Alignment:
+        """The start in the isotopy class of the settings.
+
+        Raises:
+            NsmError: ``out_of_range``: there are fewer likely classes.
+        """
+        number = self.config.get("isotopy_class", 0)  # absent in older run folders
+        if number >= len(self.alignments):
+            raise NsmError(
+                f"isotopy_class={number}: there are {len(self.alignments)} likely classes; give a "
+                f"number from 0 to {len(self.alignments) - 1}",
+                kind="out_of_range",
+                key="isotopy_class",
+            )
+        return self.alignments[number]
+
+    def begin_again(self, module: Any) -> bool:
+        """Whether the isotopy class is wrong: landmarks are still missed, or the map is worse than
+        a start in the next class before any training. The next class is then tried."""
+        if self.domain.has_boundary:
+            return False
+        number = self.config.isotopy_class
+        if number + 1 >= min(_CLASSES_TRIED, len(self.alignments)):
+            return False
+        result = self.make_result(module)
+        after = mean_log_distortion(self.surface, result.image)
+        missed = float(module.landmark_error().detach().max()) if len(module.points) else 0.0
+        following = self.alignments[number + 1]
+        wrong = missed > _MISSED or following.distortion < after
+        self.console.print(
+            f"isotopy class {number}: mean log distortion {after:.3f}, landmarks missed by "
+            f"{missed:.3g} % of the diagonal at worst; class {number + 1} before its training: "
+            f"{following.distortion:.3f}" + (f"; class {number + 1} is tried" if wrong else ""),
+            soft_wrap=True,
+        )
+        if wrong:
+            self.config.isotopy_class = number + 1
+        return wrong
 
     def make_result(self, module: Any) -> SurfaceMap:
         ids = np.stack(self.ids, axis=1)
@@ -111,33 +183,60 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        if len(source.seam_pairs) and source.domain.has_boundary:
+            result.metrics.update(result.weld.figures(target.bounding_box_diagonal))
+
+    def warnings(self, result: SurfaceMap) -> list[Text]:
+        name = f"{self.surface.name} → {self.psi.surface.name}"
+        torn = warning_of_tears(name, result.metrics)
+        return [] if torn is None else [torn]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
-        return {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}
+        said = {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}
+        if self.domain.has_boundary:
+            return said
+        classes = [
+            {"matrix": a.matrix.astype(int).tolist(), "shift": a.shift.tolist(), "score": a.score}
+            for a in self.alignments[:_CLASSES_SHOWN]
+        ]
+        return {**said, "isotopy_class": self.config.isotopy_class, "isotopy_classes": classes}
 
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
 
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
-        image = f.target.in_original_units(f.image)
-        np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))
+        _write_image(folder, f)
         meshes = {
-            "mapped": (image, s.faces, s.uv),
-            "target_with_source_uv": (f.target.in_original_units(t.vertices), t.faces, f.source_uv),
-            "source_with_target_uv": (f.source.in_original_units(s.vertices), s.faces, f.image_uv),
+            "target_with_source_uv": (f.target.in_original_units(t.vertices), t, f.source_uv),
+            "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
         for name, mesh in meshes.items():
-            export_mesh(folder / f"{name}.obj", *mesh)
-            export_mesh(folder / f"{name}.glb", *mesh, texture=checkerboard())
+            for ending in (".obj", ".glb"):
+                export_surface(folder / f"{name}{ending}", *mesh)
         (folder / "morph").mkdir(exist_ok=True)
         for k in range(_MORPH_FRAMES):
-            vertices = f.morph(k / (_MORPH_FRAMES - 1))
-            export_mesh(folder / "morph" / f"{k:02d}.obj", vertices, s.faces, s.uv)
+            frame = f.morph(k / (_MORPH_FRAMES - 1))
+            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_image(folder: Path, f: SurfaceMap) -> None:
+    """The source's mesh on the target, welded: a closed one is closed."""
+    s, weld = f.source.surface, f.weld
+    image = f.target.in_original_units(f.welded_image)
+    np.save(folder / "mapped_vertices.npy", image)
+    points = f.target.in_original_units(weld.points)
+    export_surface(folder / "mapped.glb", points, s, s.uv)
+    if s.domain.has_boundary:
+        export_mesh(folder / "mapped.obj", image, weld.faces, s.uv, corners=weld.corners)
+    else:
+        export_surface(folder / "mapped.obj", points, s, s.uv)

@@ -14,10 +14,12 @@ import pytorch_lightning as pl
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.text import Text
 
 from nsm.domains import Surface, domain
 from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
+from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
 from nsm.tasks.training import Training
 
@@ -97,10 +99,13 @@ class Task:
             NsmError: ``wrong_domain``: the task needs a domain with boundary.
         """
         self.config, self.console = config, console
+        if is_automatic(config.domain):
+            return  # until the inputs are known
         self.domain = domain(config.domain)
         if not (self.domain.has_boundary or self.closed_domains):
             raise NsmError(
-                f"domain={self.domain} serves task=overfit; take domain=disc for task={self.name}",
+                f"domain={self.domain} has no boundary, which task={self.name} needs: take "
+                "domain=disc",
                 kind="wrong_domain",
                 key="domain",
             )
@@ -114,6 +119,22 @@ class Task:
         """Make the paths in settings absolute: a run can then be resumed from any folder."""
         for key in keys:
             self.config[key] = _absolute(self.settings[key])
+
+    def inputs(self, given: Given) -> list[Any]:
+        """The surfaces that the run is given, as settings or callers name them, which say what
+        ``domain=auto`` is; with none, it is the disc."""
+        return []
+
+    def choose_domain(self, given: Given) -> None:
+        """Put the domain that suits the inputs in place of ``domain=auto``.
+
+        Raises:
+            NsmError: an input that cannot be used.
+        """
+        if is_automatic(self.config.domain):
+            closed = self.closed_domains
+            choose_domain(self.config, self.inputs(given), self.console, closed=closed)
+            self.setup(self.config, self.console)
 
     def prepare(self, given: Given) -> None:
         """Find and prepare the inputs, and set ``surface``; the configuration's paths become
@@ -167,12 +188,23 @@ class Task:
         )
         return data
 
+    def begin_again(self, module: Any) -> bool:
+        """Whether a trained module shows that another start is needed; the settings then have it.
+
+        The task says so. A run that is resumed begins with the start in its settings.
+        """
+        return False
+
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""
         raise NotImplementedError
 
     def measure(self, result: Any) -> None:
         """Put the figures into ``result.metrics``."""
+
+    def warnings(self, result: Any) -> list[Text]:
+        """What is said after the figures, where the result is not what a user would expect."""
+        return []
 
     def figures(self, result: Any) -> dict[str, Any]:
         """What metrics.json says beside ``metrics``, such as the names of inputs."""

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.results.files import atomic_write
+from nsm.results.textures import checkerboard, checkerboard_at
 
 
 def export_mesh(
@@ -21,13 +23,15 @@ def export_mesh(
     *,
     texture: Image.Image | None = None,
     colours: np.ndarray | None = None,
+    corners: np.ndarray | None = None,
 ) -> None:
     """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
 
     A closed surface without a seam has no coordinates that are continuous on it: it goes without
     (None), and a GLB file may have colours (V, 3) in [0, 1] at the vertices instead of a texture.
     Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file contains the
-    texture; beside an OBJ file go a material file and a PNG.
+    texture; beside an OBJ file go a material file and a PNG. In an OBJ file the triangles' corners
+    may have rows of uv of their own, corners (F, 3), instead of those of their vertices.
 
     Raises:
         NsmError: ``unknown_format``: the file's ending is neither .obj nor .glb.
@@ -56,8 +60,27 @@ def export_mesh(
         lines += [f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist()]
     else:
         lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
-        lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
+        both = np.stack([faces, faces if corners is None else corners], axis=2) + 1
+        lines += ["f {}/{} {}/{} {}/{}\n".format(*f) for f in both.reshape(-1, 6).tolist()]
     atomic_write(target, "".join(lines).encode())
+
+
+def export_surface(
+    path: str | Path, vertices: np.ndarray, surface: Surface, uv: np.ndarray
+) -> None:
+    """Write a surface's mesh with other vertices (V, 3), and a checkerboard over coordinates uv
+    (V, 2); arguments and errors as for :func:`export_mesh`.
+
+    A surface on a closed domain is written whole, with the vertices and faces of its file and
+    without coordinates.
+    """
+    glb = Path(path).suffix.lower() == ".glb"
+    if surface.domain.has_boundary:
+        export_mesh(path, vertices, surface.faces, uv, texture=checkerboard() if glb else None)
+        return
+    first, faces = surface.whole()
+    colours = checkerboard_at(uv[first]) if glb else None
+    export_mesh(path, vertices[first], faces, None, colours=colours)
 
 
 def _glb(
