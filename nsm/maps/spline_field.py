@@ -98,44 +98,13 @@ class SplineField(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        """Settings from which :func:`nsm.maps.build_stored` makes it again, as fine as it is."""
+        """Settings from which :func:`nsm.maps.build_stored` makes it again."""
         return {
             "_target_": target_of(type(self)).replace("nsm.maps.spline_field.", "nsm.maps."),
             "out_dim": self.out_dim,
             "cells": self.cells,
             "periodic": self.periodic,
         }
-
-    def refine(self) -> None:
-        """Twice as many cells along each axis, and the same function.
-
-        The two-scale relation of quadratic B-splines: a coefficient's share is ¾ and ¼.
-        """
-        c = self.coefficients.detach().view(self.side, self.side, -1)
-        for axis in (0, 1):
-            n = c.shape[axis]
-            a, b = c, c.roll(-1, axis)
-            if not self.periodic:
-                a, b = c.narrow(axis, 0, n - 1), c.narrow(axis, 1, n - 1)
-            c = torch.stack([0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b], dim=axis + 1)
-            c = c.flatten(axis, axis + 1)
-            if self.periodic:  # the first of them lies between the last coefficient and the first
-                c = c.roll(1, axis)
-        self._resize(c.flatten(0, 1).clone())
-
-    def _resize(self, coefficients: Tensor) -> None:
-        """Other coefficients in the same parameter, which an optimizer may hold."""
-        self.coefficients.grad = None
-        self.coefficients.data = coefficients
-        self._recent.clear()
-
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        stored = state.get(prefix + "coefficients")
-        if isinstance(stored, Tensor) and len(stored) != len(self.coefficients):
-            side = round(len(stored) ** 0.5)
-            if stored.shape == (side * side, self.out_dim):  # of another level
-                self._resize(self.coefficients.data.new_zeros(stored.shape))
-        super()._load_from_state_dict(state, prefix, *rest)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_recent": []}

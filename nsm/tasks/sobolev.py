@@ -7,6 +7,9 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from nsm.maps import SplineField
+from nsm.tasks.multigrid import periodic_refinement_along, refinement_along
+
 
 @lru_cache(maxsize=32)
 def _axis(count: int, cells: int, periodic: bool) -> tuple[Tensor, Tensor]:
@@ -51,3 +54,49 @@ class Sobolev:
         grid = c.view(side, side, -1)
         spectrum = torch.einsum("ai,abd,bj->ijd", q, grid, q) * self.scale
         return torch.einsum("ai,ijd,bj->abd", q, spectrum, q).reshape(c.shape)
+
+
+class Level:
+    """The splines of n × n cells among those of a field's own grid.
+
+    Args:
+        field: its coefficients' number, type and device count.
+        cells: n; the field has n times a power of two.
+
+    Raises:
+        ValueError: it has not.
+    """
+
+    def __init__(self, field: SplineField, cells: int) -> None:
+        ups, finer = [], cells
+        along = periodic_refinement_along if field.periodic else refinement_along
+        while cells >= 3 and finer < field.cells:
+            ups.append(along(finer))
+            finer *= 2
+        if finer != field.cells:
+            raise ValueError(
+                f"map.cells {field.cells} is not optimizer.levels' {cells}, 3 or more, times a "
+                "power of two"
+            )
+        like = field.coefficients.detach()
+        self.side = field.side - field.cells + cells
+        self.sobolev = Sobolev(self.side, cells, field.periodic, like)
+        self.up: Tensor | None = None
+        for matrix in ups:
+            up = torch.as_tensor(matrix.toarray())
+            self.up = up if self.up is None else up @ self.up
+        self.up = None if self.up is None else self.up.to(like)
+
+    def prolonged(self, c: Tensor) -> Tensor:
+        """The same spline's coefficients on the field's grid, (side², d) each."""
+        if self.up is None:
+            return c
+        grid = c.view(self.side, self.side, -1)
+        return torch.einsum("ai,ijd,bj->abd", self.up, grid, self.up).flatten(0, 1)
+
+    def restricted(self, g: Tensor) -> Tensor:
+        """The gradient by the level's coefficients, of that by the field's; the transpose."""
+        if self.up is None:
+            return g.clone()
+        grid = g.view(len(self.up), len(self.up), -1)
+        return torch.einsum("ai,abd,bj->ijd", self.up, grid, self.up).flatten(0, 1)
