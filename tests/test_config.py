@@ -37,6 +37,8 @@ TASKS = {
     ("constraints", "param"): "param",
     ("constraints", "pair"): "pair_map",
     ("constraints", "paper_pair"): "collection_map",
+    ("constraints", "fast_pair"): "pair_map",
+    ("experiment", "fast"): "pair_map",
     ("experiment", "paper_pair"): "pair_map",
     ("data", "collection"): "collection_map",
 }

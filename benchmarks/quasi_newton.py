@@ -1,0 +1,68 @@
+"""Maps between animals by quasi-Newton steps beside the default, from ready surfaces.
+
+    python benchmarks/quasi_newton.py --meshes FOLDER [--pairs 384-388 ...]
+
+Seconds are the CPU time of a map on one thread, with its certificate and figures; both ways of a
+pair run in turn in one process. Pairs that are in the file are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import nsm
+
+RESULTS = Path(__file__).parent / "results" / "quasi_newton.json"
+WAYS = {"default": [], "fast": ["experiment=fast"]}
+FIGURES = (
+    *(f"symmetric_dirichlet_{k}" for k in ("median", "mean", "p95")),
+    *("flipped_percent", "landmark_error_mean_percent", "landmark_error_max_percent", "certified"),
+)
+
+
+def compared(meshes: Path, source: str, target: str) -> dict[str, Any]:
+    """Seconds and figures of each way, from the neural surfaces of a pair."""
+    names = [f"shrec07-{name}" for name in (source, target)]
+    files = [str(meshes / f"{name}.off") for name in names]
+    marks = [str(meshes / "landmarks" / f"{name}.vts") for name in names]
+    short = ["trainer.max_steps=1", "certification.rounds=0"]
+    ready = nsm.map_pair(*files, marks, overrides=short, progress=False)
+    result: dict[str, Any] = {"domain": str(ready.source.surface.domain)}
+    for way, overrides in WAYS.items():
+        start = time.process_time()
+        f = nsm.map_pair(
+            ready.source,
+            ready.target,
+            ready.landmarks.tolist(),
+            overrides=overrides,
+            progress=False,
+        )
+        seconds = time.process_time() - start
+        result[way] = {
+            "seconds": round(seconds, 1),
+            **{key: round(float(f.metrics[key]), 4) for key in FIGURES},
+        }
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--meshes", type=Path, required=True)
+    parser.add_argument("--pairs", nargs="+", default=["384-388", "381-393", "388-381", "393-384"])
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    for pair in given.pairs:
+        if pair not in known:
+            known[pair] = compared(given.meshes, *pair.split("-"))
+            RESULTS.write_text(json.dumps(known, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
