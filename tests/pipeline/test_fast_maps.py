@@ -1,0 +1,106 @@
+"""experiment=fast: maps by quasi-Newton steps, as users run them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import nsm
+from nsm.config import compose_config
+from nsm.energies import first_fundamental_form, symmetric_dirichlet
+from nsm.maps import Composition, build_analytic
+from nsm.pipeline import run_task
+from nsm.pipeline.task import Given
+from nsm.results import NeuralSurface, callbacks
+from nsm.surfaces.shapes import ring_mesh
+from tests.tiny import dome
+
+WORDS = [
+    "task=pair_map",
+    "domain=disc",
+    "experiment=fast",
+    "map.cells=16",
+    "optimizer.levels=[8,16]",
+    "optimizer.steps=[2]",
+    "data.points=[1024,4096]",
+    "data.steps_per_epoch=2",
+    "data.held_out=256",
+    "trainer.tabulated=64",
+    "trainer.max_steps=4",
+    "trainer.progress=false",
+    "artefacts=false",
+    "logger=none",
+]
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    """A flat and a steep paraboloid."""
+    return [
+        NeuralSurface(
+            dome(height, 12),
+            build_analytic({"name": "paraboloid", "curvature": -height}),
+            {"rms_percent": 0.0},
+            {},
+        )
+        for height in (0.1, 1.2)
+    ]
+
+
+MARKS = [[5, 5], [100, 100], [200, 201], [300, 300]]
+
+
+def run(surfaces, folder, *words, marks=MARKS, **extra):
+    phi, psi = surfaces
+    given = Given(source=phi, target=psi, landmarks=marks)
+    return run_task(compose_config([*WORDS, *words]), folder, given, **extra)
+
+
+def energy(f):
+    """The mean energy of a map between the paraboloids, by area of the source."""
+    uv = torch.as_tensor(ring_mesh(30)[0], dtype=torch.float32)
+    source = first_fundamental_form(f.source.map.value_and_jacobian(uv)[1])
+    jacobian = Composition(f.target.map, f.map).value_and_jacobian(uv)[1]
+    share = torch.linalg.det(source).sqrt()
+    values = symmetric_dirichlet(source, first_fundamental_form(jacobian))
+    return float((share * values).sum() / share.sum())
+
+
+def test_quasi_newton_steps_lower_the_energy(surfaces, tmp_path):
+    few = ["trainer.max_steps=1", "optimizer.iterations=1"]
+    start = run(surfaces, tmp_path / "few", *few, marks=None)
+    end = run(surfaces, tmp_path / "more", marks=None)
+    assert 3.98 < energy(end) < energy(start) - 0.01
+
+
+def test_quasi_newton_steps_meet_the_landmarks(surfaces, tmp_path):
+    f = run(surfaces, tmp_path / "run", "trainer.max_steps=8")
+    assert f.metrics["landmark_error_max_percent"] < 0.1
+    assert f.certificate["certified"]
+    summary = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert summary["steps"] == 8 and not summary["faults"]["rollbacks"]
+
+
+def test_an_interrupted_fast_map_ends_at_the_same_result(surfaces, tmp_path, monkeypatch):
+    whole = run(surfaces, tmp_path / "whole")
+    written = callbacks.AtomicCheckpoint.on_train_epoch_end
+
+    def stop(self, trainer, module):
+        written(self, trainer, module)
+        if trainer.global_step == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(surfaces, tmp_path / "parted")
+    monkeypatch.undo()
+    resumed = run(surfaces, tmp_path / "parted", resuming=True)
+    assert np.array_equal(resumed.image_uv, whole.image_uv)
+
+
+def test_a_stored_fast_map_is_loaded_again(surfaces, tmp_path):
+    f = run(surfaces, tmp_path / "run")
+    again = nsm.load(tmp_path / "run")
+    uv = torch.as_tensor(f.source.surface.uv[:50], dtype=torch.float32)
+    assert torch.equal(again.map(uv), f.map(uv))
