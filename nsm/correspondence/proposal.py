@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,21 @@ def proposed(
             kept.append(hypothesis)
     margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
     return Proposal(kept, margin)
+
+
+def proposed_for_all(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Landmarks (L, k) of k closed meshes: those proposed for the first and each other one.
+
+    Args:
+        meshes: vertices (V, 3) and faces (F, 3) of each.
+
+    Raises:
+        NsmError: as :func:`proposed`.
+    """
+    pairs = [proposed(meshes[0], other).hypotheses[0].vertices for other in meshes[1:]]
+    common = [v for v in pairs[0][:, 0] if all(v in found[:, 0] for found in pairs)]
+    rows = [[v, *(found[found[:, 0] == v, 1][0] for found in pairs)] for v in common]
+    return np.array(rows, dtype=np.int64).reshape(-1, len(meshes))
 
 
 def _hypothesis(candidate: Candidate) -> Hypothesis:
