@@ -120,7 +120,8 @@ def _start(shapes: Sequence[EditedShape], file: Path | None, empty: bool) -> Lan
     from nsm.correspondence.proposal import proposed_for_all
 
     try:
-        return LandmarkList(count, proposed_for_all([(s.vertices, s.faces) for s in shapes]).T)
+        found = proposed_for_all([(s.vertices, s.faces) for s in shapes])
     except NsmError as error:
         print(f"begins without landmarks: {error}", flush=True)
         return LandmarkList(count)
+    return LandmarkList(count, list(found.T))
