@@ -32,6 +32,7 @@ bench-steps: .venv/.nsm-dev
 # Maps between the meshes in MESHES, and flattening compared with libigl: over an hour.
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
+	$(BIN)/python benchmarks/closed_maps.py $(if $(MESHES),--meshes $(MESHES))
 
 # Closed surfaces on the disc and on the orbifold, default settings: ten minutes. MESHES as above.
 bench-closed: .venv/.nsm-dev

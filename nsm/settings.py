@@ -408,6 +408,8 @@ class Settings:
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
             b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
             task=pair_map with two closed meshes of genus 0: landmarks are proposed.
+        isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
+            begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
         loss_terms: your own terms: +loss_terms.mine._target_=mypackage.MyTerm
             +loss_terms.mine.weight=0.1.
         callbacks: Lightning callbacks: +callbacks.mine._target_=mypackage.MyCallback.
@@ -426,6 +428,7 @@ class Settings:
     landmarks: str | list[Any] | dict[str, Any] | None = None
     attributes: AttributesSettings = field(default_factory=AttributesSettings)
     proposal: ProposalSettings = field(default_factory=ProposalSettings)
+    isotopy_class: Whole = 0
     seam: SeamSettings = field(default_factory=SeamSettings)
     certification: CertificationSettings = field(default_factory=CertificationSettings)
     trainer: TrainerSettings = field(default_factory=TrainerSettings)

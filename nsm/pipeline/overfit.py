@@ -9,7 +9,7 @@ import numpy as np
 
 from nsm.data import SurfaceData
 from nsm.domains import Surface
-from nsm.pipeline.configured_surface import configured_surface, report_surface
+from nsm.pipeline.configured_surface import configured_surface, keep_absolute, report_surface
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
@@ -38,6 +38,13 @@ class OverfitTask(Task):
     table = staticmethod(metrics_table)
     closed_domains = True
     start: Overfit | None = None
+
+    def inputs(self, given: Given) -> list[Any]:
+        if given.surface is not None:
+            return [given.surface]
+        keep_absolute(self.config)
+        settings = self.config.surface
+        return [settings.name if settings.path is None else settings.path]
 
     def prepare(self, given: Given) -> None:
         surface = given.surface

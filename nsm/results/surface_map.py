@@ -21,6 +21,7 @@ from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import placed_map
 from nsm.results.points import as_points, as_values
+from nsm.results.welding import Weld, weld
 from nsm.surfaces.location import Places, locate
 
 FORMAT = "nsm-surface-map"
@@ -118,6 +119,20 @@ class SurfaceMap:
     def image(self) -> np.ndarray:
         """Images (V, 3) of the cut source's vertices on the target, in normalised units."""
         return self.target.surface.at(self.image_uv)
+
+    @cached_property
+    def weld(self) -> Weld:
+        """The image with one point for all copies of a seam vertex (see :func:`weld`); copies of a
+        landmark go where its first one goes."""
+        s, t = self.source.surface, self.target.surface
+        kept = np.unique(s.cut_vertex[self.landmarks[:, 0]])
+        return weld(s, t, self._forth, kept)
+
+    @cached_property
+    def welded_image(self) -> np.ndarray:
+        """Images (W, 3) of the mesh file's vertices on the target, welded, in normalised units;
+        with the faces of ``weld`` the image of a closed mesh is closed."""
+        return by_file_vertex(self.source.surface, self.weld.points)
 
     @cached_property
     def _forth(self) -> Places:
