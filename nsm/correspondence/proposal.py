@@ -15,8 +15,8 @@ _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which 
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
 _AROUND = 0.3  # a tip's neighbourhood, over √area
-_LEAST_MARGIN = 0.15
-_LARGEST_ENERGY = 10.0
+_LEAST_MARGIN = 0.2
+_LARGEST_SCORE = 3.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Proposal:
     @property
     def sure(self) -> bool:
         """Whether the first is far ahead of the second, and good in itself."""
-        return self.margin > _LEAST_MARGIN and self.hypotheses[0].energy < _LARGEST_ENERGY
+        return self.margin > _LEAST_MARGIN and self.hypotheses[0].score < _LARGEST_SCORE
 
 
 def proposed(
