@@ -115,7 +115,7 @@ def read_texture(path: str | Path, image: str | Path | None = None) -> Texture:
     if all(one.size <= 4 for one in found) and image is None:
         reason = "its materials have no image; give one with texture=FILE"
         raise error_in(file, "missing_texture", reason)
-    bare: np.ndarray = np.isnan(uv).any(axis=2).any(axis=1)
+    bare = np.asarray(np.isnan(uv).any(axis=(1, 2)))
     # a face in one colour needs no coordinates
     painted = np.array([one.size > 4 for one in found])[number.reshape(-1)]
     faulty = np.flatnonzero(bare & painted)
