@@ -20,13 +20,13 @@ from scipy.spatial import cKDTree
 
 import nsm
 from nsm.domains import Disc, Keys
+from nsm.domains.common_cut import common_fractions
 from nsm.domains.common_seams import (
     aligned_keys,
     boundary_keys,
     corresponding_paths,
     edge_lengths,
 )
-from nsm.domains.joint_preparation import common_fractions
 from nsm.results import by_file_vertex
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths

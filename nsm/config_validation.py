@@ -29,7 +29,7 @@ from nsm.settings import Misfit, Parameter, Settings, fit, parameters, parts
 SUPPLIED: dict[str, tuple[str, ...]] = {
     "map": ("out_dim", "activation", "encoding"),
     "encoding": ("in_dim",),
-    "data": ("surface", "surfaces", "rotations", "sampler", "seed"),
+    "data": ("surface", "surfaces", "starts", "sampler", "seed"),
     "optimizer": ("params", "groups"),
     "scheduler": ("optimizer", "max_steps"),
     "logger": ("folder", "first_step", "every"),

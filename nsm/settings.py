@@ -387,8 +387,8 @@ class Settings:
 
     Args:
         source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface.
-        target: the same; or an analytic surface: a name (sphere_cap, plane, ...) or
-            '{name: graph, z: 0.3*u*v}'.
+        target: the same; or an analytic surface: a name (sphere_cap, plane, ...; sphere with
+            domain=orbifold, torus with domain=torus) or '{name: graph, z: 0.3*u*v}'.
         surfaces: of task=collection_map: three surfaces or more, each as source.
         landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned or .json, one for
             each surface; or pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z] stands for

@@ -14,6 +14,7 @@ from nsm.data.sampling import SurfaceSampler
 from nsm.data.shard import Shard
 from nsm.data.surface import HELD_OUT_BATCH, HELD_OUT_SEED, Steps, ready
 from nsm.domains import Surface
+from nsm.maps import LatticeAligned, Rotated
 from nsm.settings import Count
 
 
@@ -22,7 +23,8 @@ class CollectionData(pl.LightningDataModule):
 
     Args:
         surfaces: the prepared surfaces.
-        rotations: (k, 2, 2) from the common domain to that of each surface.
+        starts: where each h_i starts; their inverses take points of the surfaces' domains to the
+            common one.
         sampler: draws the training samples of each surface; a pool is drawn for each.
         batch_size: points in a step, of all surfaces together.
         steps_per_epoch: steps between two evaluations of the held-out points.
@@ -33,7 +35,7 @@ class CollectionData(pl.LightningDataModule):
     def __init__(
         self,
         surfaces: Sequence[Surface],
-        rotations: Tensor,
+        starts: Sequence[Rotated | LatticeAligned],
         sampler: Draws | None = None,
         *,
         batch_size: Count,
@@ -42,7 +44,7 @@ class CollectionData(pl.LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.surfaces, self.rotations, self.sampler = surfaces, rotations, sampler or Sampler()
+        self.surfaces, self.starts, self.sampler = surfaces, starts, sampler or Sampler()
         self.share = max(1, batch_size // len(surfaces))
         self.held_share = max(1, held_out // len(surfaces))
         self.steps_per_epoch, self.seed = steps_per_epoch, seed
@@ -53,16 +55,16 @@ class CollectionData(pl.LightningDataModule):
         self.part = Shard.of(self.trainer)
         self.points = [SurfaceSampler(surface, device) for surface in self.surfaces]
         self.own_samplers = [ready(self.sampler, points, self.seed) for points in self.points]
-        self.rotations = self.rotations.to(device)
+        self.starts = [start.to(device) for start in self.starts]
 
     def batch(self, step: int) -> Tensor:
         """The training samples (N, 2) of a step; of several processes, this one's share of them."""
         # one stream for all: the samples of the surfaces are independent
         generator = self.points[0].generator(self.seed, step)
         parts = [
-            sampler.draw(points, self.share, generator).uv @ rotation  # R⁻¹ = Rᵀ
-            for sampler, points, rotation in zip(
-                self.own_samplers, self.points, self.rotations, strict=True
+            start.back(sampler.draw(points, self.share, generator).uv)
+            for sampler, points, start in zip(
+                self.own_samplers, self.points, self.starts, strict=True
             )
         ]
         return self.part.of_rows(torch.cat(parts))
@@ -73,7 +75,7 @@ class CollectionData(pl.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Tensor]:
         generator = self.points[0].generator(HELD_OUT_SEED, 0)
         parts = [
-            points.by_area(self.held_share, generator).uv @ rotation
-            for points, rotation in zip(self.points, self.rotations, strict=True)
+            start.back(points.by_area(self.held_share, generator).uv)
+            for points, start in zip(self.points, self.starts, strict=True)
         ]
         return DataLoader(list(torch.cat(parts).split(HELD_OUT_BATCH)), batch_size=None)  # type: ignore[arg-type]

@@ -81,8 +81,21 @@ class Domain(ABC):
         """
 
     @abstractmethod
-    def certificate(self, uv: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
-        """The verdict on the piecewise linear map that sends a mesh's vertices to uv (V, 2) in Ω.
+    def certificate(
+        self,
+        image: np.ndarray,
+        faces: np.ndarray,
+        *,
+        rest: np.ndarray | None = None,
+        copies: np.ndarray | None = None,
+    ) -> dict[str, Any]:
+        """The verdict on the piecewise linear map that sends a mesh's vertices to points of Ω.
+
+        Args:
+            image: (V, 2) where the vertices are sent.
+            faces: (F, 3).
+            rest, copies: on a closed domain, the vertices (V, 2) before the map, and pairs (T, 2)
+                of those that are one point of the surface.
 
         Returns:
             ``certified``, true if all counts are zero, and these counts, by exact signs;
@@ -91,7 +104,12 @@ class Domain(ABC):
 
     @abstractmethod
     def repaired(
-        self, rest: np.ndarray, faces: np.ndarray, image: np.ndarray, held: np.ndarray
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        image: np.ndarray,
+        held: np.ndarray,
+        copies: np.ndarray | None = None,
     ) -> np.ndarray:
         """The image (V, 2) of a mesh over Ω, with flipped triangles turned back where possible.
 
@@ -101,7 +119,32 @@ class Domain(ABC):
             image: (V, 2) where the map sends its vertices.
             held: (V,) mask of vertices, such as landmarks, that move only if flips remain
                 otherwise.
+            copies: as for :meth:`certificate`.
         """
+
+    def copied(self, rest: np.ndarray, copies: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """The image (V, 2), made the same to the last digit for copies of one point of a closed
+        domain; arguments as for :meth:`repaired`."""
+        return image
+
+    def carried(
+        self,
+        points: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
+        faces: np.ndarray,
+        copies: np.ndarray,
+    ) -> np.ndarray:
+        """Images (N, 2) of points (N, 2) under the map that is linear on the triangles.
+
+        Args:
+            points: of Ω; on a closed domain in any lift, and the images are in the lift that the
+                map sends them to.
+            before, after: (V, 2) the vertices of a mesh over Ω, and their images.
+            faces: (F, 3).
+            copies: as for :meth:`certificate`.
+        """
+        return locate(points, before, faces).take(after, faces)
 
     @abstractmethod
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -110,6 +153,10 @@ class Domain(ABC):
     def locate(self, points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Places:
         """The places of points (N, 2) of Ω on a mesh laid out over it, uv (V, 2), faces (F, 3)."""
         return locate(points, uv, faces)
+
+    def canonical(self, points: np.ndarray) -> np.ndarray:
+        """Of the lifts of points (N, 2), those (N, 2) in the fundamental domain of a closed Ω."""
+        return points
 
     def lift(self, points: Tensor, near: Tensor) -> Tensor:
         """The representatives of points (N, 2) of Ω nearest to others (N, 2) in the plane."""
@@ -140,13 +187,18 @@ class Domain(ABC):
         """
 
     def encoding(
-        self, settings: Mapping[str, Any], lattice: np.ndarray | None = None
+        self,
+        settings: Mapping[str, Any],
+        lattice: np.ndarray | None = None,
+        *,
+        of_map: bool = False,
     ) -> dict[str, Any]:
         """The settings of an encoding with Ω's symmetries, from those that a user gives.
 
         Args:
             settings: with ``_target_``.
             lattice: (2, 2) of the surface, on a closed domain.
+            of_map: for the network of :meth:`equivariant`, not for a surface's.
         """
         return dict(settings)
 
@@ -306,14 +358,21 @@ class BoundedDomain(Domain):
         """See :func:`nsm.domains.embedding.embed`."""
         return embedding.embed(self, vertices, faces, method=method, name=name, keys=keys)
 
-    def certificate(self, uv: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    def certificate(
+        self,
+        image: np.ndarray,
+        faces: np.ndarray,
+        *,
+        rest: np.ndarray | None = None,
+        copies: np.ndarray | None = None,
+    ) -> dict[str, Any]:
         """As :meth:`Domain.certificate`: the boundary should go around ∂Ω once, in order.
 
         ``boundary_order_violations`` counts sides that do not run counter-clockwise around the
         middle of Ω.
         """
-        flipped = int(planar_mesh.flipped(uv, faces).sum())
-        wrong = planar_mesh.order_violations(uv[boundary_loops(faces)[0]])
+        flipped = int(planar_mesh.flipped(image, faces).sum())
+        wrong = planar_mesh.order_violations(image[boundary_loops(faces)[0]])
         return {
             "certified": flipped == 0 and wrong == 0,
             "flipped_triangles": flipped,
@@ -321,7 +380,12 @@ class BoundedDomain(Domain):
         }
 
     def repaired(
-        self, rest: np.ndarray, faces: np.ndarray, image: np.ndarray, held: np.ndarray
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        image: np.ndarray,
+        held: np.ndarray,
+        copies: np.ndarray | None = None,
     ) -> np.ndarray:
         """As :meth:`Domain.repaired`; the boundary's vertices move along ∂Ω only, and only if they
         are out of order."""

@@ -3,38 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from nsm.domains.base import BoundedDomain, Domain, Keys
-from nsm.domains.common_seams import (
-    SEAMS,
-    aligned_keys,
-    boundary_keys,
-    corresponding_paths,
-    mutually_far,
-    seam_costs,
-)
-from nsm.domains.disc import Disc
+from nsm.domains.common_cut import best_common_cut, common_fractions
+from nsm.domains.common_seams import aligned_keys, boundary_keys
 from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
+from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
-from nsm.surfaces.cutting import Cut, cut_along_paths
-from nsm.surfaces.geometry import triangle_distortion
-from nsm.surfaces.location import locate
 from nsm.surfaces.validation import CleanMesh, clean
-
-# seam=auto tries seams through these shares of the landmarks
-_SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
-_DISC = Disc()  # where seams are compared, whatever the domain
-_WORST = 1e3  # upper bound on a triangle's distortion
 
 
 @dataclass(frozen=True)
@@ -59,9 +44,10 @@ def prepare_jointly(
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
-    Closed genus-0 meshes with two landmarks or more are cut along corresponding seams, and the
-    landmarks on the seam get the same places on ∂Ω in all of them. Other meshes are prepared one
-    by one.
+    For a domain with boundary, closed genus-0 meshes with two landmarks or more are cut along
+    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. On
+    the orbifold, meshes with four landmarks or more get the same four as their cones, those whose
+    domains are least distorted in the mean. Other meshes are prepared one by one.
 
     Args:
         meshes: two or more.
@@ -79,8 +65,8 @@ def prepare_jointly(
     domain = domain_of(domain)
     cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
-    closed = _common_topology(meshes, cleaned) == (0, 0)
-    if not closed or len(found[0]) < 2:
+    enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
+    if _common_topology(meshes, cleaned) != (0, 0) or not enough:
         return [
             Surface.from_arrays(
                 m.vertices,
@@ -113,13 +99,41 @@ def prepare_jointly(
                 for m, s in zip(meshes, stored, strict=True)
                 if s is not None
             ]
-    surfaces = _cut_and_embed(
-        meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
-    )
+    if domain.has_boundary:
+        surfaces = _cut_and_embed(
+            meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
+        )
+    else:
+        surfaces = _with_common_cones(meshes, cleaned, found, domain, parameterization)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
     return surfaces
+
+
+def _with_common_cones(
+    meshes: Sequence[Mesh],
+    cleaned: Sequence[CleanMesh],
+    landmarks: Sequence[np.ndarray],
+    domain: Domain,
+    method: str,
+) -> list[Surface]:
+    numbers, score = choose_common_cones([(c.vertices, c.faces) for c in cleaned], landmarks)
+    line = (
+        f"cones at landmarks {numbers.tolist()}, counted from 0, the same on all meshes: mean log "
+        f"distortion {score:.3f}"
+    )
+    return [
+        Surface.from_closed(
+            c,
+            name=m.name,
+            domain=domain,
+            parameterization=method,
+            cones=ids[numbers].tolist(),
+            log=(*m.log, *c.log, line),
+        )
+        for m, c, ids in zip(meshes, cleaned, landmarks, strict=True)
+    ]
 
 
 def _common_topology(meshes: Sequence[Mesh], cleaned: Sequence[CleanMesh]) -> tuple[int, int]:
@@ -157,16 +171,6 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
     return kept
 
 
-@dataclass(frozen=True)
-class _CommonCut:
-    """One way to cut all meshes: the discs, and the keys (K,) on each boundary."""
-
-    seam: str
-    count: int
-    cuts: list[Cut]
-    keys: list[np.ndarray]
-
-
 def _cut_and_embed(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
@@ -176,37 +180,12 @@ def _cut_and_embed(
     seam: str,
     seam_landmarks: int | None,
 ) -> list[Surface]:
-    total = len(landmarks[0])
-    costs = {
-        path: [seam_costs(c.vertices, c.faces, path) for c in cleaned]
-        for path in (SEAMS if seam == "auto" else (seam,))
-    }
-    if seam == "auto":
-        counts = (
-            [seam_landmarks]
-            if seam_landmarks
-            else sorted({max(2, round(share * total)) for share in _SHARES})
-        )
-        tried = [
-            (_disagreement(way, landmarks), k, way)
-            for k, (path, count) in enumerate(itertools.product(SEAMS, counts))
-            if (way := _common_cut(meshes, cleaned, landmarks, path, costs[path], count))
-            is not None
-        ]
-        best = min(tried, default=(0.0, 0, None))[2]
-    else:
-        best = _common_cut(meshes, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
-    if best is None:
-        raise NsmError(
-            "no seams through the landmarks were found: some are too close together for the "
-            "meshes' edges; leave one of them out, or subdivide the mesh",
-            kind="no_common_seam",
-            key="landmarks",
-        )
+    names = [m.name for m in meshes]
+    best = best_common_cut(names, cleaned, landmarks, seam, seam_landmarks)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     line = (
-        f"seam led along {best.seam} paths through {best.count} of {total} landmarks, the same "
-        "on all meshes"
+        f"seam led along {best.seam} paths through {best.count} of {len(landmarks[0])} landmarks, "
+        "the same on all meshes"
     )
     return [
         Surface.from_cut(
@@ -220,98 +199,6 @@ def _cut_and_embed(
         )
         for m, c, cut, key in zip(meshes, cleaned, best.cuts, best.keys, strict=True)
     ]
-
-
-def _common_cut(
-    meshes: Sequence[Mesh],
-    cleaned: Sequence[CleanMesh],
-    landmarks: Sequence[np.ndarray],
-    seam: str,
-    costs: Sequence[np.ndarray],
-    count: int,
-) -> _CommonCut | None:
-    """The meshes cut along one tree through ``count`` landmarks, whose branches are the cheapest
-    by costs (E,) of each mesh's edges; None if there is no such tree."""
-    pairs = [(c.vertices, c.faces) for c in cleaned]
-    chosen = mutually_far(pairs, landmarks, count)
-    on_seam = [ids[chosen] for ids in landmarks]
-    paths = corresponding_paths(pairs, on_seam, costs, avoid=landmarks)
-    if paths is None:
-        return None
-    cuts = [
-        cut_along_paths(c.vertices, c.faces, p, name=m.name)
-        for c, p, m in zip(cleaned, paths, meshes, strict=True)
-    ]
-    keys = aligned_keys(
-        [boundary_keys(cut.origin, cut.loop, ids) for cut, ids in zip(cuts, on_seam, strict=True)]
-    )
-    assert keys is not None, "branches in the same cyclic order make equal walks"
-    return _CommonCut(seam, len(chosen), cuts, [k[:, 1] for k in keys])
-
-
-def _disagreement(way: _CommonCut, landmarks: Sequence[np.ndarray]) -> float:
-    """How badly the domains agree: the distortion of the identity between two domains, times how
-    far it misses the landmarks off the seam.
-
-    The worst ordered pair counts. Landmarks on the wrong side of a seam lie far apart in Ω, and no
-    map without folds brings them together; hence the factor.
-    """
-    fractions = np.mean(
-        [_arc_lengths(cut, key) for cut, key in zip(way.cuts, way.keys, strict=True)], axis=0
-    )
-    flat = [
-        _DISC.embed(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
-        for cut, key in zip(_of_disc_area(way.cuts), way.keys, strict=True)
-    ]
-    places = []
-    for cut, uv, ids in zip(way.cuts, flat, landmarks, strict=True):
-        off = [int(np.flatnonzero(cut.origin == v)[0]) for v in ids]
-        inner = [v for v in off if v not in set(cut.loop.tolist())]
-        places.append(uv[inner])
-    worst = 0.0
-    discs = _of_disc_area(way.cuts)
-    for i, j in itertools.permutations(range(len(discs)), 2):
-        image = locate(flat[i], flat[j], discs[j].faces).take(discs[j].vertices, discs[j].faces)
-        value = triangle_distortion(discs[i].vertices, image, discs[i].faces)
-        area = topology.face_areas(discs[i].vertices, discs[i].faces)
-        mean = float(np.average(np.minimum(value, _WORST), weights=area))
-        miss = np.linalg.norm(places[i] - places[j], axis=1).max(initial=0.0)
-        worst = max(worst, mean * (1 + float(miss)))
-    return worst
-
-
-def _of_disc_area(cuts: Sequence[Cut]) -> list[Cut]:
-    """The discs scaled to the area of Ω."""
-    scales = [np.sqrt(_DISC.area / topology.face_areas(c.vertices, c.faces).sum()) for c in cuts]
-    return [replace(c, vertices=c.vertices * s) for c, s in zip(cuts, scales, strict=True)]
-
-
-def _arc_lengths(cut: Cut, keys: np.ndarray) -> np.ndarray:
-    """Fractions (K,) of the boundary's length at which its keys lie, the first at 0."""
-    loop = np.roll(cut.loop, -int(np.flatnonzero(cut.loop == keys[0])[0]))
-    points = cut.vertices[loop]
-    lengths = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    along = np.concatenate([[0.0], np.cumsum(lengths)[:-1]]) / lengths.sum()
-    place = {int(v): k for k, v in enumerate(loop)}
-    return along[[place[int(v)] for v in keys]]
-
-
-def common_fractions(
-    cuts: Sequence[Cut], keys: Sequence[np.ndarray], domain: BoundedDomain
-) -> np.ndarray:
-    """Places (K,) on ∂Ω, as fractions of the way around, that suit the keys of all discs.
-
-    Each disc is flattened with its boundary free to slide; the gaps between its keys are averaged
-    over the discs. The keys nearest to the domain's corners become the corners.
-    """
-    gaps = []
-    for cut, key in zip(_of_disc_area(cuts), keys, strict=True):
-        uv = _DISC.embed(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
-        angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
-        gaps.append((np.roll(angle, -1) - angle) % 1.0)
-    mean = np.mean(gaps, axis=0)
-    fractions = np.concatenate([[0.0], np.cumsum(mean / mean.sum())[:-1]])
-    return domain.through_corners(fractions)
 
 
 @dataclass(frozen=True)
@@ -357,7 +244,7 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
     """Corresponding points in the domains of surfaces.
 
     A landmark on the seam has several preimages on ∂Ω; they correspond in the order in which the
-    boundary passes them.
+    boundary passes them. On a closed domain each has one, in one of its lifts.
 
     Args:
         surfaces: all of one domain.
@@ -366,6 +253,9 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
     Raises:
         NsmError: a landmark that a surface does not have, or boundaries that do not correspond.
     """
+    if not surfaces[0].domain.has_boundary:
+        points = [s.preimages(ids.tolist()) for s, ids in zip(surfaces, landmarks, strict=True)]
+        return Matched(points, np.arange(len(landmarks[0])), 0)
     keys = [
         boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], s.kept(ids.tolist()))
         for s, ids in zip(surfaces, landmarks, strict=True)

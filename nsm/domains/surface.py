@@ -21,7 +21,7 @@ from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies
+from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies, seam_pairs
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays, load_mesh
 from nsm.surfaces.validation import CleanMesh, clean
@@ -281,14 +281,13 @@ class Surface:
         origin, uv, faces = flat.copies()
         first = first_copies(origin, len(mesh.vertices))
         quality = {
-            "flipped_triangles": 0.0,
+            "flipped_triangles": float(flipped_triangles(uv, faces)),
             "median_symmetric_dirichlet": float(np.median(flat.distortions(centred))),
             "seconds": time.perf_counter() - start,
         }
         chosen: tuple[str, ...] = ()
         if flat.cones is not None:
             chosen = (f"cones at vertices {mesh.source_vertex[flat.cones].tolist()}",)
-        again = np.flatnonzero(first[origin] != np.arange(len(origin)))
         return cls(
             name=name,
             vertices=(centred * scale)[origin],
@@ -297,7 +296,7 @@ class Surface:
             domain=domain,
             source_vertex=mesh.source_vertex[origin],
             cut_vertex=np.where(mesh.merged >= 0, first[mesh.merged], -1),
-            seam_pairs=np.stack([first[origin[again]], again], axis=1),
+            seam_pairs=seam_pairs(origin),
             scale=scale,
             center=center,
             quality=quality,
@@ -338,6 +337,10 @@ class Surface:
         """
         _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    def at(self, uv: np.ndarray) -> np.ndarray:
+        """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
+        return self.domain.locate(uv, self.uv, self.faces).take(self.vertices, self.faces)
 
     @property
     def bounding_box_diagonal(self) -> float:
@@ -398,20 +401,29 @@ def as_it_lies(
     faces: np.ndarray,
     uv: np.ndarray,
     domain: str | Domain,
-    seam_pairs: np.ndarray | None = None,
+    *,
+    origin: np.ndarray | None = None,
+    lattice: np.ndarray | None = None,
 ) -> Surface:
-    """A surface from a mesh that is laid out already, not scaled and not checked."""
+    """A surface from a mesh that is laid out already, not scaled and not checked.
+
+    Args:
+        name, vertices, faces, uv, domain, lattice: as in the surface.
+        origin: (V,) numbers, equal for copies of one vertex; by default there are no copies.
+    """
+    origin = np.arange(len(uv)) if origin is None else origin
     return Surface(
         name=name,
         vertices=vertices,
         faces=faces,
         uv=uv,
         domain=domain_of(domain),
-        source_vertex=np.arange(len(uv)),
-        cut_vertex=np.arange(len(uv)),
-        seam_pairs=np.zeros((0, 2), dtype=np.int64) if seam_pairs is None else seam_pairs,
+        source_vertex=origin,
+        cut_vertex=first_copies(origin, int(origin.max()) + 1),
+        seam_pairs=seam_pairs(origin),
         scale=1.0,
         center=np.zeros(3),
+        lattice=lattice,
     )
 
 

@@ -8,12 +8,15 @@ mesh does not move.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.optimize import isotonic_regression, minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.planar_mesh import cross, flipped, signed_areas
+from nsm.surfaces import topology
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
@@ -23,8 +26,42 @@ _ROOM = 1e-6
 _GAP = 0.02
 
 
+@dataclass(frozen=True)
+class Copies:
+    """Vertices of a flat mesh that are copies of others and move with them.
+
+    Attributes:
+        first: (V,) the vertex that each is a copy of; itself if it is none.
+        sign: (V,) 1 or -1, and shift: (V, 2): v lies at sign * (place of first) + shift.
+        step: places of first ones are multiples of it, so that those of copies are exact; 0 for
+            any places.
+    """
+
+    first: np.ndarray
+    sign: np.ndarray
+    shift: np.ndarray
+    step: float = 0.0
+
+    @classmethod
+    def none(cls, count: int) -> Copies:
+        """All of so many vertices move by themselves."""
+        return cls(np.arange(count), np.ones(count), np.zeros((count, 2)))
+
+    def rounded(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 2) to multiples of ``step``."""
+        return np.rint(points / self.step) * self.step if self.step else points
+
+    def placed(self, image: np.ndarray) -> np.ndarray:
+        """The image (V, 2) with first vertices rounded and copies where these send them."""
+        return self.sign[:, None] * self.rounded(image)[self.first] + self.shift
+
+
 def untangled(
-    rest: np.ndarray, faces: np.ndarray, image: np.ndarray, fixed: np.ndarray
+    rest: np.ndarray,
+    faces: np.ndarray,
+    image: np.ndarray,
+    fixed: np.ndarray,
+    copies: Copies | None = None,
 ) -> np.ndarray:
     """The image of a flat mesh, with its flipped triangles turned back where possible.
 
@@ -32,87 +69,104 @@ def untangled(
         rest: (V, 2) the mesh before it is mapped, no triangle of it flipped.
         faces: (F, 3).
         image: (V, 2) where the map sends its vertices.
-        fixed: (V,) mask of vertices that may not move.
+        fixed: (V,) mask of vertices that may not move, nor may their copies.
+        copies: vertices that move with others, which ``image`` agrees with; none by default.
 
     Returns:
         (V, 2): ``image``, except for vertices near a flip, which follow the local affine map as
         closely as possible. The caller counts flips that remain.
     """
     image = np.array(image, dtype=np.float64)
+    copies = Copies.none(len(image)) if copies is None else copies
+    joined = copies.first[faces]  # the triangles with each vertex by one number
+    held = np.zeros(len(image), dtype=bool)
+    held[copies.first[fixed]] = True
     for rings in _RINGS:
         bad = flipped(image, faces)
         if not bad.any():
             break
         near = np.zeros(len(image), dtype=bool)
-        near[faces[bad]] = True
+        near[joined[bad]] = True
         for _ in range(rings - 1):
-            near[faces[near[faces].any(axis=1)]] = True
-        for patch in _patches(faces, near & ~fixed, bad):
-            _solve(rest, patch, image, ~fixed & near)
-        if near.all():
+            near[joined[near[joined].any(axis=1)]] = True
+        free = near & ~held
+        for patch in _patches(joined, free, bad):
+            _solve(rest, faces[patch], image, free, copies)
+        if near[joined].all():
             break
     return image
 
 
 def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.ndarray]:
-    """The faces (P, 3) around each connected group of free vertices that has a flip."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    """The numbers (P,) of the faces around each connected group of free vertices with a flip."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = edges[free[edges].all(axis=1)]
-    edges = np.concatenate([edges, faces[:, [2, 0]][free[faces[:, [2, 0]]].all(axis=1)]])
     n = len(free)
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
     label = np.where(free, connected_components(graph, directed=False)[1], -1)
     of_face = label[faces].max(axis=1)  # the free vertices of a face are all in one group
     wanted = np.unique(of_face[bad])
-    return [faces[of_face == group] for group in wanted[wanted >= 0].tolist()]
+    return [np.flatnonzero(of_face == group) for group in wanted[wanted >= 0].tolist()]
 
 
-def _solve(rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndarray) -> None:
+def _solve(
+    rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndarray, copies: Copies
+) -> None:
     """Move free vertices of a patch (P, 3) in ``image``, if that leaves no flip in the patch."""
-    vertices = np.unique(faces)
-    affine = _affine_fit(rest[vertices], image[vertices])
+    vertices, number = topology.renumbered(faces, len(image))
+    faces = number[faces]
+    affine = _affine_fit(_sides(rest[vertices], faces), _sides(image[vertices], faces))
     if affine is None:
         return
-    shape = rest @ affine.T
+    shape = rest[vertices] @ affine.T
     area = signed_areas(shape, faces)
     if not (area > 0).all():
         return
     inverse = _cofactors(_sides(shape, faces)).transpose(0, 2, 1) / (2 * area[:, None, None])
-    moving = vertices[free[vertices]]
-    trial = image.copy()
+    mobile = np.flatnonzero(free[copies.first[vertices]])
+    moving, which = np.unique(copies.first[vertices[mobile]], return_inverse=True)
+    sign, shift = copies.sign[vertices[mobile], None], copies.shift[vertices[mobile]]
+    trial = image[vertices]
+
+    def place(x: np.ndarray) -> None:
+        trial[mobile] = sign * x.reshape(-1, 2)[which] + shift
 
     def determinants() -> np.ndarray:
         return signed_areas(trial, faces) / area
 
-    least = determinants().min()
+    least, x = determinants().min(), image[moving]
     for _ in range(_ROUNDS):
         # Escobar et al. 2003: enough smoothing to pull at the worst, and less as it gets better
         epsilon = np.sqrt(1e-12 + 0.04 * min(least, 0.0) ** 2)
 
         def energy(x: np.ndarray, epsilon: float = epsilon) -> tuple[float, np.ndarray]:
-            trial[moving] = x.reshape(-1, 2)
+            place(x)
             value, force = _energy(trial, faces, inverse, epsilon)
-            return value, force[moving].ravel()
+            gradient = np.zeros((len(moving), 2))
+            np.add.at(gradient, which, sign * force[mobile])
+            return value, gradient.ravel()
 
         found = minimize(
             energy,
-            trial[moving].ravel(),
+            x.ravel(),
             jac=True,
             method="L-BFGS-B",
             options={"maxiter": _ITERATIONS, "maxcor": 20},
         )
         if not np.isfinite(found.x).all():
             return
-        trial[moving] = found.x.reshape(-1, 2)
+        x = copies.rounded(found.x.reshape(-1, 2))
+        place(x)
         least = determinants().min()
         if least > _ROOM and not flipped(trial, faces).any():
-            image[moving] = trial[moving]
+            image[moving] = x
+            image[vertices] = trial
             return
 
 
 def _affine_fit(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
-    """The least-squares linear map (2, 2) between centred points, or None if it reflects."""
-    x, y = before - before.mean(axis=0), after - after.mean(axis=0)
+    """The least-squares linear map (2, 2) between sides (F, 2, 2), or None if it reflects."""
+    x, y = (sides.transpose(0, 2, 1).reshape(-1, 2) for sides in (before, after))
     matrix = np.linalg.lstsq(x, y, rcond=None)[0].T
     return matrix if np.linalg.det(matrix) > 0 else None
 

@@ -2,9 +2,11 @@
 
 from nsm.maps.activations import Activation, as_activation
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Formula, build_analytic
+from nsm.maps.analytic_closed import ClosedAnalyticSurface
 from nsm.maps.batched_maps import batched
-from nsm.maps.composition import Composition, PointMap, Rotated
+from nsm.maps.composition import Composition, LatticeAligned, PointMap, Rotated
 from nsm.maps.encodings import Encoding, Identity, RandomFourierFeatures, SplineGrid
+from nsm.maps.equivariant import EquivariantMap, TorusMap
 from nsm.maps.inverse import TransitionMap, inverted
 from nsm.maps.lattice_grid import LatticeSplineGrid
 from nsm.maps.networks import BLOCKS, NeuralMap, build_network, build_stored
@@ -15,12 +17,15 @@ __all__ = [
     "BLOCKS",
     "Activation",
     "AnalyticSurface",
+    "ClosedAnalyticSurface",
     "Composition",
     "DiscMap",
     "Encoding",
+    "EquivariantMap",
     "Formula",
     "Identity",
     "IdentityInitializedMap",
+    "LatticeAligned",
     "LatticeSplineGrid",
     "NeuralMap",
     "PlanarMap",
@@ -29,6 +34,7 @@ __all__ = [
     "Rotated",
     "SplineGrid",
     "SquareMap",
+    "TorusMap",
     "TransitionMap",
     "as_activation",
     "batched",

@@ -1,9 +1,9 @@
 """Surfaces in closed form: targets that need no overfit network.
 
 Each shape is a function of (u, v), over the unit disc (or the square around it), that PyTorch
-differentiates in forward mode. It is scaled as a whole so that the part over the unit disc has
-area ``area``, π by default, as every surface of the method has; ``area=None`` keeps the size that
-the formula gives.
+differentiates in forward mode; :mod:`nsm.maps.analytic_closed` has those over closed domains. It is
+scaled as a whole so that the part over the unit disc has area ``area``, π by default, as every
+surface of the method has; ``area=None`` keeps the size that the formula gives.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -41,7 +41,8 @@ class AnalyticSurface(nn.Module):
     attributes, and answer ``point``.
 
     Args:
-        area: area of the surface over the unit disc, or None for no scaling.
+        area: area of the surface over Ω (the unit disc, if it is not closed), or None for no
+            scaling.
         **parameters: of the shape.
 
     Attributes:
@@ -49,10 +50,11 @@ class AnalyticSurface(nn.Module):
 
     Raises:
         NsmError: the area is not positive, or the surface has no finite positive area, or its
-            values and derivatives are not finite on all of the closed disc.
+            values and derivatives are not finite on all of Ω.
     """
 
     name: str
+    closed_domain: ClassVar[str | None] = None  # the one domain of a closed surface, by its name
 
     def __init__(self, area: float | None, **parameters: Any) -> None:
         super().__init__()
@@ -71,8 +73,8 @@ class AnalyticSurface(nn.Module):
             raise NsmError(message, kind="out_of_range", key=parameter)
 
     def _natural_area(self) -> float:
-        inner, rim = _disc_nodes()
-        nodes = torch.cat([inner, rim, torch.zeros(1, 2, dtype=inner.dtype)])
+        inner, further, measure = self._nodes()
+        nodes = torch.cat([inner, further])
         for x in (nodes, nodes.float()):  # training runs in float32, whose range is the smaller
             value, jacobian = self.value_and_jacobian(x)
             finite = torch.cat([value, jacobian.flatten(1)], dim=1).isfinite().all(dim=1)
@@ -82,11 +84,16 @@ class AnalyticSurface(nn.Module):
                 raise NsmError(message, kind="not_finite", key=self.name)
         _, jacobian = self.value_and_jacobian(inner)
         columns = jacobian.unbind(dim=-1)
-        area = math.pi * float(torch.linalg.cross(*columns, dim=-1).norm(dim=-1).mean())
+        area = measure * float(torch.linalg.cross(*columns, dim=-1).norm(dim=-1).mean())
         if not 0 < area < math.inf:
-            message = f"{self.name}: its area over the unit disc is {area}"
+            message = f"{self.name}: its area is {area}"
             raise NsmError(message, kind="out_of_range", key=self.name)
         return area
+
+    def _nodes(self) -> tuple[Tensor, Tensor, float]:
+        """Points (N, 2) of Ω, each for the same share of it; further ones to check; Ω's area."""
+        inner, rim = _disc_nodes()
+        return inner, torch.cat([rim, torch.zeros(1, 2, dtype=rim.dtype)]), math.pi
 
     def point(self, u: Tensor, v: Tensor) -> Triple:
         """Unscaled coordinates, each (N,), at u (N,) and v (N,)."""
@@ -328,6 +335,7 @@ class Formula(AnalyticSurface):
 
 
 _KINDS = (Plane, SphereCap, Cylinder, Cone, Paraboloid, Saddle, TorusPatch, MobiusGraph, Graph)
+# by name; the closed ones and users' own are added to it
 ANALYTIC: dict[str, Callable[..., AnalyticSurface]] = {kind.name: kind for kind in _KINDS}
 
 
@@ -345,7 +353,8 @@ def build_analytic(config: Mapping[str, Any], trust: Iterable[str] = ()) -> Anal
     """
     parameters = dict(config)
     target = parameters.pop("_target_", None)
-    name = {target_of(kind): kind.name for kind in _KINDS}.get(target)
+    known = {target_of(kind): name for name, kind in ANALYTIC.items() if inspect.isclass(kind)}
+    name = known.get(target)
     if target is not None and name is None:
         surface = instantiate_stored(config, trust=trust)
         if not isinstance(surface, AnalyticSurface):

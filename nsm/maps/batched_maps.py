@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from nsm.maps.composition import PointMap, Rotated
+from nsm.maps.composition import LatticeAligned, PointMap, Rotated
 from nsm.maps.encodings import SplineGrid, transformed, value_and_jacobian_stack
 from nsm.maps.mlp_with_tangents import MLPWithTangents
 from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
@@ -103,9 +103,9 @@ def batched(maps: Sequence[nn.Module]) -> Any:
         A module with ``value_and_jacobian``.
     """
     first = maps[0]
-    if all(isinstance(m, Rotated) for m in maps):
-        turned = cast(Sequence[Rotated], maps)
-        return Rotated.all_of(turned, batched([m.inner for m in turned]))
+    if isinstance(first, (Rotated, LatticeAligned)) and all(type(m) is type(first) for m in maps):
+        turned = cast(Sequence[Any], maps)
+        return type(first).all_of(turned, batched([m.inner for m in turned]))
     if all(type(m) is type(first) for m in maps):
         if isinstance(first, IdentityInitializedMap):
             inner = [cast(IdentityInitializedMap, m).network for m in maps]

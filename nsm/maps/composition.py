@@ -64,6 +64,10 @@ class Rotated(nn.Module):
         self.inner = inner
         self.register_buffer("rotation", rotation.detach().clone())
 
+    def around(self, inner: nn.Module) -> Rotated:
+        """The same rotation of another map's input."""
+        return Rotated(inner, self.rotation)
+
     @classmethod
     def all_of(cls, turned: Sequence[Rotated], inner: nn.Module) -> Rotated:
         """k such maps as one of points (k, N, 2), around a batch of their inner maps."""
@@ -73,11 +77,82 @@ class Rotated(nn.Module):
         made.register_buffer("rotation", torch.stack([one.rotation for one in turned]))
         return made
 
+    def before(self, x: Tensor) -> Tensor:
+        """R x: points (..., N, 2) to those where the inner map starts."""
+        return x @ self.rotation.mT
+
+    def back(self, x: Tensor) -> Tensor:
+        """R⁻¹ x: the inverse of :meth:`before`."""
+        return x @ self.rotation
+
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, n)."""
-        return self.inner(x @ self.rotation.mT)
+        return self.inner(self.before(x))
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, n) and Jacobians J_inner(R x)·R, (N, n, 2)."""
-        value, jacobian = cast(PointMap, self.inner).value_and_jacobian(x @ self.rotation.mT)
+        value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self.before(x))
         return value, jacobian @ self.rotation.unsqueeze(-3)
+
+
+class LatticeAligned(nn.Module):
+    """x ↦ inner(B x + c) on a closed domain R²/Γ, with B in SL(2, Z) fixed beforehand.
+
+    x ↦ B x + c takes orbits of Γ to orbits. B and c say which cones correspond, and the isotopy
+    class of the map.
+
+    Args:
+        inner: (N, 2) to (N, n), with ``value_and_jacobian``.
+        matrix: B (2, 2), integers with determinant 1.
+        shift: c (2,); on an orbifold integers.
+
+    Raises:
+        ValueError: B is not of determinant 1, or has other numbers than integers.
+    """
+
+    matrix: Tensor
+    shift: Tensor
+
+    def __init__(self, inner: nn.Module, matrix: Tensor, shift: Tensor) -> None:
+        super().__init__()
+        if matrix.shape != (2, 2) or shift.shape != (2,):
+            raise ValueError(f"(2, 2) and (2,) wanted, not {matrix.shape} and {shift.shape}")
+        (a, b), (c, d) = matrix.tolist()
+        if any(e != round(e) for e in (a, b, c, d)) or a * d - b * c != 1:
+            raise ValueError(f"not integers with determinant 1: {matrix.tolist()}")
+        if not bool(torch.isfinite(shift).all()):
+            raise ValueError(f"not finite: {shift.tolist()}")
+        self.inner = inner
+        self.register_buffer("matrix", matrix.detach().clone())
+        self.register_buffer("shift", shift.detach().clone())
+
+    def around(self, inner: nn.Module) -> LatticeAligned:
+        """The same affine map of another map's input."""
+        return LatticeAligned(inner, self.matrix, self.shift)
+
+    @classmethod
+    def all_of(cls, aligned: Sequence[LatticeAligned], inner: nn.Module) -> LatticeAligned:
+        """k such maps as one of points (k, N, 2), around a batch of their inner maps."""
+        made = cls.__new__(cls)
+        nn.Module.__init__(made)
+        made.inner = inner
+        made.register_buffer("matrix", torch.stack([one.matrix for one in aligned]))
+        made.register_buffer("shift", torch.stack([one.shift for one in aligned]))
+        return made
+
+    def before(self, x: Tensor) -> Tensor:
+        """B x + c: points (..., N, 2) to those where the inner map starts."""
+        return x @ self.matrix.mT + self.shift.unsqueeze(-2)
+
+    def back(self, x: Tensor) -> Tensor:
+        """B⁻¹ (x - c): the inverse of :meth:`before`."""
+        return (x - self.shift.unsqueeze(-2)) @ torch.linalg.inv(self.matrix).round().mT
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, 2) to (N, n)."""
+        return self.inner(self.before(x))
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) to the values (N, n) and Jacobians J_inner(B x + c)·B, (N, n, 2)."""
+        value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self.before(x))
+        return value, jacobian @ self.matrix.unsqueeze(-3)

@@ -13,6 +13,26 @@ _DEGREE = 2
 _TAPS = torch.arange(-1, 2)
 
 
+def into_domain(x: Tensor, even: bool) -> tuple[Tensor, Tensor]:
+    """Points moved by Γ into the fundamental domain, differentiable.
+
+    Args:
+        x: (2, N) in any lift.
+        even: whether x ↦ -x is in Γ, beside the translations by 2e₁ and 2e₂.
+
+    Returns:
+        (2, N) in [-1, 1]², in its upper half if ``even``; and signs (N,), -1 for points that were
+        turned.
+    """
+    y = x - 2 * torch.round(x / 2)
+    sign = torch.ones_like(y[0])
+    if even:
+        turned = (y[1] < 0) | ((y[1] == 0) & (y[0] < 0))
+        sign = torch.where(turned, -sign, sign).detach()
+        y = sign * y
+    return y, sign
+
+
 class LatticeSplineGrid(SplineGrid):
     """Multi-resolution grids on R²/Γ, blended by uniform quadratic B-splines: C¹ everywhere.
 
@@ -82,12 +102,7 @@ class LatticeSplineGrid(SplineGrid):
     ) -> tuple[Tensor, list[list[Tensor]]]:
         """As :meth:`SplineGrid._seen`."""
         cells = torch.tensor(resolutions or self.resolutions, device=x.device)  # (L, 2)
-        y = (x - 2 * torch.round(x / 2)).t()  # (2, N) in [-1, 1]
-        sign = torch.ones_like(y[0])
-        if self.even:
-            turned = (y[1] < 0) | ((y[1] == 0) & (y[0] < 0))
-            sign = torch.where(turned, -sign, sign).detach()
-            y = sign * y
+        y, sign = into_domain(x.t(), self.even)
         size = cells[:, :, None].to(x.dtype)
         z = (y + 1) * (0.5 * size)
         cell = z.detach().floor().clamp(min=0).minimum(size - 1)

@@ -59,7 +59,9 @@ class IdentityInitializedMap(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        target = target_of(type(self)).replace("nsm.maps.planar.", "nsm.maps.")
+        target = target_of(type(self))
+        for module in ("planar", "equivariant"):
+            target = target.replace(f"nsm.maps.{module}.", "nsm.maps.")
         return {"_target_": target, "network": self.network.config}
 
 

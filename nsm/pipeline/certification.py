@@ -53,8 +53,9 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
             break
         result = task.make_result(module)
         best = min(best, result, key=_faults)
-    after = best.certificate
-    say(verdict(after) + ("" if before["certified"] else f"; before: {verdict(before)}"))
+    after, what = best.certificate, getattr(best, "statement", "injective")
+    earlier = "" if before["certified"] else f"; before repair: {verdict(before, what)}"
+    say(verdict(after, what) + earlier, soft_wrap=True)
     if after.get(_OVERLAPS):
         say("the free boundary overlaps itself; constraints.boundary=fixed rules that out")
     counts = {name: n for name, n in before.items() if name != "certified"}

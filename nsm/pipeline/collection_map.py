@@ -9,28 +9,31 @@ from typing import Any
 import numpy as np
 import pytorch_lightning as pl
 import torch
+from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
 from nsm.domains.joint_preparation import Matched, matched_landmarks
+from nsm.domains.orbifold.alignment import alignments_to_first
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
+from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.resolve_inputs import landmark_vertices, neural_surfaces, read_shape
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     SurfaceCollection,
     by_file_vertex,
-    checkerboard,
     collection_metrics,
     collection_table,
-    export_mesh,
+    export_surface,
     figures_picture,
     map_image,
     transfer_matrix_picture,
+    warning_of_tears,
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import CollectionMap
-from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
 
 _SEAM_POINTS = 24  # on each branch
 _RINGS = 80  # of an even mesh of the common domain
@@ -46,6 +49,7 @@ class CollectionMapTask(Task):
     module, data = CollectionMap, CollectionData
     result, defaults = SurfaceCollection, "collection_map"
     certified = True
+    closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
 
@@ -71,13 +75,21 @@ class CollectionMapTask(Task):
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)
-        self.targets, self.rotations = targets, self._rotations(targets)
-        self.points = (targets @ self.rotations).mean(dim=0)  # each turned back, R⁻¹ = Rᵀ
+        self.targets, self.starts = targets, self._starts(targets)
+        back = torch.stack([h.back(q) for h, q in zip(self.starts, targets, strict=True)])
+        if not self.domain.has_boundary:
+            back = torch.stack([self.domain.lift(x, targets[0]) for x in back])
+        self.points = back.mean(dim=0)
         on_boundary = slice(self.matched.on_boundary)
-        self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
+        if self.domain.has_boundary:
+            self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
 
-    def _rotations(self, targets: torch.Tensor) -> torch.Tensor:
-        """(k, 2, 2), from the common domain to those of the surfaces."""
+    def _starts(self, targets: torch.Tensor) -> list[Rotated | LatticeAligned]:
+        """Rotations, or affine maps of the lattice, from the common domain to the surfaces'."""
+        surfaces = [phi.surface for phi in self.phis]
+        if not self.domain.has_boundary:
+            common = self.ids if targets.shape[1] else None
+            return [aligned(found.inverse) for found in alignments_to_first(surfaces, common)]
         uv = torch.as_tensor(self.surface.uv, dtype=torch.float32)
         some = uv[:: len(uv) // 4096 + 1]
         first, *others = self.phis
@@ -88,7 +100,7 @@ class CollectionMapTask(Task):
             else:
                 rotation = least_distorting_rotation(self.domain, first.map, phi.map, some)
                 rotations.append(rotation)
-        return torch.stack(rotations)
+        return [Rotated(torch.nn.Identity(), rotation) for rotation in rotations]
 
     @property
     def title(self) -> str:
@@ -100,7 +112,7 @@ class CollectionMapTask(Task):
             points=self.points,
             targets=self.targets,
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
-            rotations=self.rotations,
+            starts=self.starts,
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[phi.map for phi in self.phis],
@@ -114,8 +126,8 @@ class CollectionMapTask(Task):
         """
         even, even_faces = self.domain.mesh(_RINGS)
         vertices = [
-            torch.as_tensor(phi.surface.uv, dtype=torch.float32) @ rotation
-            for phi, rotation in zip(self.phis, self.rotations, strict=True)
+            start.back(torch.as_tensor(phi.surface.uv, dtype=torch.float32))
+            for phi, start in zip(self.phis, self.starts, strict=True)
         ]
         vertices.append(torch.as_tensor(even, dtype=torch.float32))
         first = np.cumsum([0, *(len(v) for v in vertices[:-1])])
@@ -134,7 +146,7 @@ class CollectionMapTask(Task):
 
     def build_data(self) -> pl.LightningDataModule:
         surfaces = [phi.surface for phi in self.phis]
-        return self.made_data(surfaces=surfaces, rotations=self.rotations)
+        return self.made_data(surfaces=surfaces, starts=self.starts)
 
     @property
     def data_settings(self) -> dict[str, Any]:
@@ -151,14 +163,18 @@ class CollectionMapTask(Task):
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
 
+    def warnings(self, result: SurfaceCollection) -> list[Text]:
+        every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
+        return [torn for torn in every if torn is not None]
+
     def figures(self, result: SurfaceCollection) -> dict[str, Any]:
         names = [phi.surface.name for phi in self.phis]
         return {"surfaces": names, "landmarks": len(self.ids[0])}
 
     def picture(self, module: Any) -> np.ndarray:
         # where the vertices of the first go if h_0 is taken for its start
-        rotation = self.rotations[0].double().numpy()
-        uv = evaluate(module.map[-1], self.surface.uv @ rotation)
+        start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
+        uv = evaluate(module.map[-1], start.numpy())
         return map_image(self.surface, self.phis[-1].surface, uv)
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
@@ -175,6 +191,6 @@ class CollectionMapTask(Task):
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.image)
         np.save(folder / "mapped_vertices.npy", by_file_vertex(source.surface, image))
-        vertices, faces = target.in_original_units(target.surface.vertices), target.surface.faces
+        vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
-        export_mesh(file, vertices, faces, f.source_uv, texture=checkerboard())
+        export_surface(file, vertices, target.surface, f.source_uv)

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.text import Text
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.orbifold.alignment import alignments
+from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
@@ -23,18 +26,18 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     by_file_vertex,
-    checkerboard,
     distortion_picture,
-    export_mesh,
+    export_surface,
     map_image,
     morph_pictures,
     pair_metrics,
     pair_table,
     transfer_picture,
+    warning_of_tears,
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import PairMap
-from nsm.tasks.initial_rotation import landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
 
 _MORPH_FRAMES = 9
 
@@ -43,6 +46,7 @@ class PairMapTask(Task):
     """A map from one surface to another, with least distortion."""
 
     module, data, result, defaults = PairMap, SurfaceData, SurfaceMap, "pair_map"
+    closed_domains = True
     certified = True
     table = staticmethod(pair_table)
     picture_name = "map"
@@ -66,6 +70,11 @@ class PairMapTask(Task):
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
+        if not self.domain.has_boundary:
+            common = (ids[0], ids[1]) if len(ids[0]) else None
+            self.alignments = alignments(phi.surface, psi.surface, common)
+            for one in self.alignments[:3]:
+                self.console.print(str(one.matrix.tolist()), one.shift, one.score)
 
     @property
     def title(self) -> str:
@@ -80,26 +89,34 @@ class PairMapTask(Task):
             torch.as_tensor(array, dtype=torch.float32)
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
-        if len(p):
-            rotation = landmark_rotation(self.domain, p, q)
-        else:
-            some = uv[:: len(uv) // 4096 + 1]
-            rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
-        if self.config.constraints.boundary == "penalty":
+        start = self._start(p, q)
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
             corners = torch.from_numpy(self.domain.corners).to(p)
-            p, q = torch.cat([p, corners]), torch.cat([q, corners @ rotation.T])
+            p, q = torch.cat([p, corners]), torch.cat([q, start.before(corners)])
         return self.module(
             **self.map_settings(),
             points=p,
             targets=q,
             seam=seam,
-            rotation=rotation,
+            start=start,
             mesh=(uv, torch.as_tensor(source.faces)),
             diagonal=target.bounding_box_diagonal,
             phi=self.phi.map,
             psi=self.psi.map,
         )
+
+    def _start(self, p: torch.Tensor, q: torch.Tensor) -> Rotated | LatticeAligned:
+        """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)
+        or by distortion."""
+        if not self.domain.has_boundary:
+            return aligned(self.alignments[0])
+        if len(p):
+            rotation = landmark_rotation(self.domain, p, q)
+        else:
+            some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()
+            rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
+        return Rotated(torch.nn.Identity(), rotation)
 
     def make_result(self, module: Any) -> SurfaceMap:
         ids = np.stack(self.ids, axis=1)
@@ -111,6 +128,11 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+
+    def warnings(self, result: SurfaceMap) -> list[Text]:
+        name = f"{self.surface.name} → {self.psi.surface.name}"
+        torn = warning_of_tears(name, result.metrics)
+        return [] if torn is None else [torn]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
         return {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}
@@ -127,17 +149,17 @@ class PairMapTask(Task):
         image = f.target.in_original_units(f.image)
         np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))
         meshes = {
-            "mapped": (image, s.faces, s.uv),
-            "target_with_source_uv": (f.target.in_original_units(t.vertices), t.faces, f.source_uv),
-            "source_with_target_uv": (f.source.in_original_units(s.vertices), s.faces, f.image_uv),
+            "mapped": (image, s, s.uv),
+            "target_with_source_uv": (f.target.in_original_units(t.vertices), t, f.source_uv),
+            "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
         for name, mesh in meshes.items():
-            export_mesh(folder / f"{name}.obj", *mesh)
-            export_mesh(folder / f"{name}.glb", *mesh, texture=checkerboard())
+            for ending in (".obj", ".glb"):
+                export_surface(folder / f"{name}{ending}", *mesh)
         (folder / "morph").mkdir(exist_ok=True)
         for k in range(_MORPH_FRAMES):
-            vertices = f.morph(k / (_MORPH_FRAMES - 1))
-            export_mesh(folder / "morph" / f"{k:02d}.obj", vertices, s.faces, s.uv)
+            frame = f.morph(k / (_MORPH_FRAMES - 1))
+            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)

@@ -18,7 +18,8 @@ from nsm.maps import ANALYTIC
 from nsm.pipeline.configured_surface import report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
-from nsm.surfaces.catalogue import catalogue_mesh
+from nsm.results.analytic import lies_over
+from nsm.surfaces.catalogue import catalogue_mesh, catalogue_names
 from nsm.surfaces.landmarks import (
     Landmarks,
     as_lists,
@@ -68,7 +69,7 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
         name = str(given)
         if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
             ready = load_surface(name, trust=trust)
-        elif name in ANALYTIC and key == "target":  # some are also meshes of the catalogue
+        elif key == "target" and _is_analytic(name, domain):
             return analytic_surface({"name": name}, domain)
         elif Path(name).suffix or os.sep in name or Path(name).exists():
             vertices, faces, log = load_mesh(name)
@@ -83,6 +84,17 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
             key=key,
         )
     return ready
+
+
+def _is_analytic(name: str, domain: Domain) -> bool:
+    """Whether a target's name means an analytic surface, not the mesh that may share it.
+
+    The closed ones mean the mesh on a domain with boundary, for which it can be cut.
+    """
+    if name not in ANALYTIC:
+        return False
+    cut = domain.has_boundary and not lies_over(ANALYTIC[name], domain)
+    return not (cut and name in catalogue_names())
 
 
 def vertex_count(shape: Shape) -> int:

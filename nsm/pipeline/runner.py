@@ -175,6 +175,8 @@ def finish(
     atomic_write(run.folder / "metrics.json", as_json(summary))
     if task.table is not None:
         task.console.print(task.table(result.metrics))
+    for warning in task.warnings(result):
+        task.console.print(warning, soft_wrap=True)
     if not is_temporary(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result

@@ -14,6 +14,7 @@ import pytorch_lightning as pl
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.text import Text
 
 from nsm.domains import Surface, domain
 from nsm.errors import NsmError
@@ -100,7 +101,8 @@ class Task:
         self.domain = domain(config.domain)
         if not (self.domain.has_boundary or self.closed_domains):
             raise NsmError(
-                f"domain={self.domain} serves task=overfit; take domain=disc for task={self.name}",
+                f"domain={self.domain} has no boundary, which task={self.name} needs: take "
+                "domain=disc",
                 kind="wrong_domain",
                 key="domain",
             )
@@ -173,6 +175,10 @@ class Task:
 
     def measure(self, result: Any) -> None:
         """Put the figures into ``result.metrics``."""
+
+    def warnings(self, result: Any) -> list[Text]:
+        """What is said after the figures, where the result is not what a user would expect."""
+        return []
 
     def figures(self, result: Any) -> dict[str, Any]:
         """What metrics.json says beside ``metrics``, such as the names of inputs."""

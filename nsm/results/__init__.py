@@ -6,7 +6,7 @@ from nsm.results.collection import SurfaceCollection, collection_metrics, load_c
 from nsm.results.collection_pictures import figures_picture, transfer_matrix_picture
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
-from nsm.results.meshes import export_mesh
+from nsm.results.meshes import export_mesh, export_surface
 from nsm.results.metrics import overfit_metrics, pointwise_metrics, vertex_error
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.pair_pictures import (
@@ -24,7 +24,13 @@ from nsm.results.pictures import (
     reconstruction_image,
 )
 from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map, on_cut_mesh
-from nsm.results.tables import collection_table, comparison_table, metrics_table, pair_table
+from nsm.results.tables import (
+    collection_table,
+    comparison_table,
+    metrics_table,
+    pair_table,
+    warning_of_tears,
+)
 from nsm.results.textures import checkerboard
 
 __all__ = [
@@ -44,6 +50,7 @@ __all__ = [
     "pair_metrics",
     "pair_table",
     "transfer_picture",
+    "warning_of_tears",
     "NeuralSurface",
     "Parameterization",
     "atomic_write",
@@ -52,6 +59,7 @@ __all__ = [
     "comparison_table",
     "error_picture",
     "export_mesh",
+    "export_surface",
     "layout_image",
     "load_parameterization",
     "load_surface",

@@ -1,7 +1,8 @@
 """Whether a map of a mesh to the plane is injective, counted on all of it; and its repair.
 
 A piecewise linear map of a disc-shaped mesh is injective if no triangle is flipped or flat and
-the boundary's image is a polygon that does not cross itself, run through once.
+the boundary's image is a polygon that does not cross itself, run through once. One of a closed
+surface is a homeomorphism if it is continuous, of degree one, and no triangle is flipped or flat.
 """
 
 from __future__ import annotations
@@ -20,14 +21,22 @@ from nsm.domains.untangling import untangled
 from nsm.surfaces.topology import boundary_loops
 
 
-def certificate(domain: Domain | None, uv: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
-    """The verdict on the piecewise linear map that sends a disc-shaped mesh's vertices to uv.
+def certificate(
+    domain: Domain | None,
+    uv: np.ndarray,
+    faces: np.ndarray,
+    *,
+    rest: np.ndarray | None = None,
+    copies: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """The verdict on the piecewise linear map that sends a mesh's vertices to uv.
 
     Args:
         domain: Ω, which the mesh should cover; without it the boundary is free, and may not cross
             itself.
         uv: (V, 2) images of the vertices.
         faces: (F, 3), counter-clockwise before the map.
+        rest, copies: on a closed domain, as for :meth:`nsm.domains.Domain.certificate`.
 
     Returns:
         certified; flipped_triangles; and what the domain counts beside them
@@ -35,7 +44,7 @@ def certificate(domain: Domain | None, uv: np.ndarray, faces: np.ndarray) -> dic
         if all counts, which are made with exact signs, are zero.
     """
     if domain is not None:
-        return domain.certificate(uv, faces)
+        return domain.certificate(uv, faces, rest=rest, copies=copies)
     turned = int(flipped(uv, faces).sum())
     crossings = boundary_self_intersections(uv, boundary_loops(faces)[0])
     return {
@@ -55,10 +64,22 @@ def combined(certificates: Iterable[dict[str, Any]]) -> dict[str, Any]:
     return total
 
 
-def verdict(found: dict[str, Any]) -> str:
-    """A certificate in one line."""
+def statement(domain: Domain | None, seam: bool = False) -> str:
+    """What a certificate says of a map of surfaces over Ω, or of one to the plane (None).
+
+    Args:
+        domain: Ω.
+        seam: whether the source was cut: the map is then one of the cut surface.
+    """
+    if domain is not None and not domain.has_boundary:
+        return "a homeomorphism of the closed surfaces"
+    return "injective on the cut surface" if seam else "injective"
+
+
+def verdict(found: dict[str, Any], what: str = "injective") -> str:
+    """A certificate in one line; ``what`` it says of the map, as :func:`statement` words it."""
     counts = [f"{n} {name.replace('_', ' ')}" for name, n in found.items() if name != "certified"]
-    start = "certified injective" if found["certified"] else "NOT certified injective"
+    start = f"certified {what}" if found["certified"] else f"NOT certified {what}"
     return f"{start}: {', '.join(counts)}"
 
 
@@ -68,15 +89,16 @@ def repaired(
     faces: np.ndarray,
     image: np.ndarray,
     held: np.ndarray,
+    copies: np.ndarray | None = None,
 ) -> np.ndarray:
     """The image (V, 2) of a mesh with flips turned back, where that can be done.
 
     Args:
         domain: Ω, whose boundary is kept; without it the boundary is free.
-        rest, faces, image, held: as for :meth:`nsm.domains.Domain.repaired`.
+        rest, faces, image, held, copies: as for :meth:`nsm.domains.Domain.repaired`.
     """
     if domain is not None:
-        return domain.repaired(rest, faces, image, held)
+        return domain.repaired(rest, faces, image, held, copies)
     for stay in (held, np.zeros_like(held)):
         image = untangled(rest, faces, image, stay)
     return image

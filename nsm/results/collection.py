@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
@@ -21,10 +21,9 @@ from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, combined
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.networks import rotated_map
+from nsm.results.networks import placed_map
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.surface_map import SurfaceMap
-from nsm.surfaces.location import locate
 
 FORMAT = "nsm-collection"
 STEM = "collection"
@@ -87,6 +86,11 @@ class SurfaceCollection:
         return self._made[source, target]
 
     @property
+    def statement(self) -> str:
+        """What the certificate says of each map, if it holds."""
+        return self.pair(0, 1).statement
+
+    @property
     def certificate(self) -> dict[str, Any]:
         """Whether the maps of all ordered pairs are injective (see :func:`certificate`)."""
         return combined(self.pair(*ends).certificate for ends in self._ordered)
@@ -102,18 +106,17 @@ class SurfaceCollection:
         return itertools.permutations(range(len(self)), 2)
 
     def _pair(self, source: int, target: int) -> SurfaceMap:
-        # h_i is near the rotation that it started from, so the surface's vertices, turned back,
+        # h_i is near the affine map that it starts from, so the surface's vertices, taken back,
         # lie densely in the common domain
-        first = self.maps[source]
-        turn = first.rotation.double().numpy()  # type: ignore[union-attr, operator]
-        nodes = torch.as_tensor(self.surfaces[source].surface.uv @ turn)
-        domain = self.surfaces[source].surface.domain
+        first, s = _double(self.maps[source]), self.surfaces[source].surface
+        nodes: Tensor = first.back(torch.as_tensor(s.uv))  # type: ignore[operator]
+        domain = s.domain
         project = None
         if isinstance(domain, BoundedDomain) and not isinstance(first.inner, PlanarMap):
             project = domain.project
-        h = TransitionMap(_double(first), _double(self.maps[target]), nodes, project).eval()
+        h = TransitionMap(first, _double(self.maps[target]), nodes, project).eval()
         if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
-            uv = torch.as_tensor(self.surfaces[source].surface.uv)
+            uv = torch.as_tensor(s.uv)
             self._back[source] = torch.cat([h.back(part) for part in uv.split(_CHUNK)]).numpy()
         return SurfaceMap(
             self.surfaces[source],
@@ -123,7 +126,7 @@ class SurfaceCollection:
             {},
             self.config,
             self.corrections.get((source, target), Correction()),
-            evaluate(h.second, self._back[source]),
+            domain.copied(s.uv, s.seam_pairs, evaluate(h.second, self._back[source])),
         )
 
     def save(self, folder: str | Path) -> None:
@@ -171,7 +174,7 @@ def load_collection(folder: str | Path, trust: Iterable[str] = ()) -> SurfaceCol
         for k in range(count):
             split = {name: name.partition(".") for name in tensors}
             own = {end: tensors[n] for n, (start, _, end) in split.items() if start == str(k)}
-            maps.append(rotated_map(metadata["map"], own, trust))
+            maps.append(placed_map(metadata["map"], own, trust))
         landmarks = np.array(metadata["landmarks"], dtype=np.int64).reshape(-1, count)
         metrics, config = dict(metadata["metrics"]), dict(metadata["config"])
     except DAMAGE as error:
@@ -230,9 +233,8 @@ def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int)
     surface = collection.surfaces[i].surface
     uv = surface.uv[::_CYCLE_EVERY]
     for a, b in ((i, j), (j, k), (k, i)):
-        uv = evaluate(collection.pair(a, b).map, uv)
-    end = locate(uv, surface.uv, surface.faces).take(surface.vertices, surface.faces)
-    off = np.linalg.norm(end - surface.vertices[::_CYCLE_EVERY], axis=1)
+        uv = surface.domain.canonical(evaluate(collection.pair(a, b).map, uv))
+    off = np.linalg.norm(surface.at(uv) - surface.vertices[::_CYCLE_EVERY], axis=1)
     return 100 * off / surface.bounding_box_diagonal
 
 

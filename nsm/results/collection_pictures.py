@@ -25,13 +25,16 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
     """The main figures of every ordered pair, from row to column."""
     names, k = collection.names, len(collection)
     side = max(5.0, 0.5 * k)  # inches: the numbers do not overlap
-    figure = Figure(figsize=((side + 0.2) * len(_SHOWN), side), dpi=120)
-    for n, (key, title) in enumerate(_SHOWN.items()):
+    every = {key for figures in collection.metrics["pairs"].values() for key in figures}
+    shown = {key: title for key, title in _SHOWN.items() if key in every}
+    figure = Figure(figsize=((side + 0.2) * len(shown), side), dpi=120)
+    for n, (key, title) in enumerate(shown.items()):
         values = np.full((k, k), np.nan)
         for i in range(k):
             for j in range(k):
                 if i != j:
-                    values[i, j] = collection.metrics["pairs"][collection.pair_names[i, j]][key]
+                    figures = collection.metrics["pairs"][collection.pair_names[i, j]]
+                    values[i, j] = figures.get(key, np.nan)
         axes = figure.add_subplot(1, len(_SHOWN), n + 1)
         axes.imshow(values, cmap="viridis_r")
         middle = np.nanmean([np.nanmin(values), np.nanmax(values)])

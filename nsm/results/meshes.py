@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.results.files import atomic_write
+from nsm.results.textures import checkerboard, checkerboard_at
 
 
 def export_mesh(
@@ -58,6 +60,24 @@ def export_mesh(
         lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
         lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
     atomic_write(target, "".join(lines).encode())
+
+
+def export_surface(
+    path: str | Path, vertices: np.ndarray, surface: Surface, uv: np.ndarray
+) -> None:
+    """Write a surface's mesh with other vertices (V, 3), and a checkerboard over coordinates uv
+    (V, 2); arguments and errors as for :func:`export_mesh`.
+
+    A surface on a closed domain is written whole, with the vertices and faces of its file and
+    without coordinates.
+    """
+    glb = Path(path).suffix.lower() == ".glb"
+    if surface.domain.has_boundary:
+        export_mesh(path, vertices, surface.faces, uv, texture=checkerboard() if glb else None)
+        return
+    first, faces = surface.whole()
+    colours = checkerboard_at(uv[first]) if glb else None
+    export_mesh(path, vertices[first], faces, None, colours=colours)
 
 
 def _glb(

@@ -11,7 +11,14 @@ from torch import Tensor, nn
 
 from nsm.errors import NotRegistered
 from nsm.instantiation import check_trusted, named_object
-from nsm.maps import ANALYTIC, AnalyticSurface, Rotated, build_analytic, build_stored
+from nsm.maps import (
+    ANALYTIC,
+    AnalyticSurface,
+    LatticeAligned,
+    Rotated,
+    build_analytic,
+    build_stored,
+)
 
 
 def network_of(
@@ -49,13 +56,25 @@ def network_of(
     return network.eval().requires_grad_(False)
 
 
-def rotated_map(
+def placed_map(
     config: Mapping[str, Any], tensors: Mapping[str, Tensor], trust: Iterable[str] = ()
-) -> Rotated:
-    """A map of the domain after a rotation, frozen; arguments and errors as :func:`network_of`."""
-    inner = {key.removeprefix("inner."): v for key, v in tensors.items() if key != "rotation"}
-    turned = Rotated(network_of(config, inner, trust), tensors["rotation"])
-    return turned.eval().requires_grad_(False)
+) -> Rotated | LatticeAligned:
+    """A map of the domain after a rotation, or an affine map of the lattice, frozen.
+
+    Arguments and errors as :func:`network_of`.
+    """
+    inner = {
+        key.removeprefix("inner."): v for key, v in tensors.items() if key.startswith("inner.")
+    }
+    network = network_of(config, inner, trust)
+    own = {key: v for key, v in tensors.items() if not key.startswith("inner.")}
+    if set(own) == {"rotation"}:
+        whole: Rotated | LatticeAligned = Rotated(network, own["rotation"])
+    elif set(own) == {"matrix", "shift"}:
+        whole = LatticeAligned(network, own["matrix"], own["shift"])
+    else:
+        raise ValueError(f"neither a rotation nor an affine map: {', '.join(own)}"[:200])
+    return whole.eval().requires_grad_(False)
 
 
 def _check_lengths(settings: Any, most: int) -> None:

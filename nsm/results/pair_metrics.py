@@ -21,7 +21,6 @@ from nsm.energies import (
     symmetric_dirichlet,
 )
 from nsm.results.map_metrics import summaries, triangle_metric
-from nsm.surfaces.location import locate
 from nsm.surfaces.topology import boundary_loops, face_areas
 
 ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
@@ -74,30 +73,30 @@ def pair_metrics(
 
     Returns:
         The figures of :func:`distortion_figures`; flipped_percent (signed area in Ω);
-        outside_percent of vertices; boundary_distance_max of the boundary's image from ∂Ω, in
-        units of Ω; landmark_error_mean_percent and _max_percent, on the target, of its bounding
-        box's diagonal; covered_percent of the target's area; seam_gap_mean_percent and
-        _max_percent, the distance on the target between the images of two seam vertices that
-        were one point, of the diagonal.
+        landmark_error_mean_percent and _max_percent, on the target, of its bounding box's
+        diagonal, if there are landmarks; covered_percent of the target's area. On a domain with
+        boundary also outside_percent of vertices; boundary_distance_max of the boundary's image
+        from ∂Ω, in units of Ω; and, if there is a seam, seam_gap_mean_percent and _max_percent,
+        the distance on the target between the images of two seam vertices that were one point, of
+        the diagonal.
     """
-
-    def lifted(uv: np.ndarray) -> np.ndarray:
-        return locate(uv, target.uv, target.faces).take(target.vertices, target.faces)
-
-    image = lifted(image_uv)
+    image = target.at(image_uv)
     to_percent = 100 / target.bounding_box_diagonal
     figures = distortion_figures(source.vertices, image, source.faces)
-    flipped = signed_areas(image_uv, source.faces) <= 0
-    distance = bounded(source.domain).signed_distance(torch.from_numpy(image_uv)).numpy()
-    loop = boundary_loops(source.faces)[0]
-    error = np.linalg.norm(lifted(landmark_image) - lifted(landmark_target), axis=1)
-    gap = np.linalg.norm(image[source.seam_pairs[:, 0]] - image[source.seam_pairs[:, 1]], axis=1)
-    figures["flipped_percent"] = 100 * float(flipped.mean())
-    figures["outside_percent"] = 100 * float((distance > ON_BOUNDARY).mean())
-    figures["boundary_distance_max"] = float(np.abs(distance[loop]).max())
-    for name, values in (("landmark_error", error), ("seam_gap", gap)):
-        figures[f"{name}_mean_percent"] = float(values.mean() * to_percent) if len(values) else 0.0
-        figures[f"{name}_max_percent"] = float(values.max() * to_percent) if len(values) else 0.0
+    figures["flipped_percent"] = 100 * float((signed_areas(image_uv, source.faces) <= 0).mean())
+    off = target.at(landmark_image) - target.at(landmark_target)
+    distances = {"landmark_error": np.linalg.norm(off, axis=1)}
+    if source.domain.has_boundary:
+        distance = bounded(source.domain).signed_distance(torch.from_numpy(image_uv)).numpy()
+        loop = boundary_loops(source.faces)[0]
+        figures["outside_percent"] = 100 * float((distance > ON_BOUNDARY).mean())
+        figures["boundary_distance_max"] = float(np.abs(distance[loop]).max())
+        a, b = source.seam_pairs.T
+        distances["seam_gap"] = np.linalg.norm(image[a] - image[b], axis=1)
+    for name, values in distances.items():
+        if len(values):
+            figures[f"{name}_mean_percent"] = float(values.mean() * to_percent)
+            figures[f"{name}_max_percent"] = float(values.max() * to_percent)
     figures["covered_percent"] = _covered_percent(source, target, image_uv)
     return figures
 
@@ -109,5 +108,6 @@ def _covered_percent(source: Surface, target: Surface, image_uv: np.ndarray) -> 
     face = random.choice(len(areas), size=_COVER_SAMPLES, p=areas / areas.sum())
     weights = random.dirichlet(np.ones(3), size=_COVER_SAMPLES)
     uv = (weights[:, :, None] * target.uv[target.faces[face]]).sum(axis=1)
-    nearest = locate(uv, image_uv, source.faces).take(image_uv, source.faces)
+    domain = source.domain
+    nearest = domain.carried(uv, image_uv, image_uv, source.faces, source.seam_pairs)
     return 100 * float((np.linalg.norm(nearest - uv, axis=1) <= ON_BOUNDARY).mean())

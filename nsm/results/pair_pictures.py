@@ -18,7 +18,6 @@ from nsm.results.map_metrics import triangle_metric
 from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
 from nsm.results.render import Blend, View
 from nsm.results.surface_map import SurfaceMap
-from nsm.surfaces.location import locate
 
 _STRIP, _GIF = 300, 300
 _TICKS = [4, 5, 7, 10, 20]
@@ -124,6 +123,6 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
 
 def map_image(source: Surface, target: Surface, image_uv: np.ndarray) -> np.ndarray:
     """A quick picture (384, 384, 3) uint8: the source's checkerboard on its image."""
-    image = locate(image_uv, target.uv, target.faces).take(target.vertices, target.faces)
+    image = target.at(image_uv)
     view = View(target.vertices, 384)
     return np.round(255 * view.draw(image, source.faces, checked(source.uv))).astype(np.uint8)

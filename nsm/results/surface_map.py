@@ -16,10 +16,10 @@ from torch import nn
 from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
-from nsm.results.certificate import Correction, certificate, repaired
+from nsm.results.certificate import Correction, certificate, repaired, statement
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.networks import rotated_map
+from nsm.results.networks import placed_map
 from nsm.results.points import as_points, as_values
 from nsm.surfaces.location import Places, locate
 
@@ -66,24 +66,27 @@ class SurfaceMap:
         points = as_points(points, 3, "points on the source")
         with np.errstate(over="ignore"):  # of points far away
             normalised = (points - s.center) * s.scale
-        uv = locate(normalised, s.vertices, s.faces).take(s.uv, s.faces)
-        return self.target.in_original_units(_lifted(t, self.planar(uv)))
+        image = locate(normalised, s.vertices, s.faces).take(self.image_uv, s.faces)
+        return self.target.in_original_units(t.at(image))
 
     def planar(self, uv: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the source's domain to those of the target's, (N, 2).
+
+        On a closed domain, points in any lift, and images in the lifts that h sends them to.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         s = self.source.surface
         uv = as_points(uv, 2, "points of the domain")
-        return locate(uv, s.uv, s.faces).take(self.image_uv, s.faces)
+        return s.domain.carried(uv, s.uv, self.image_uv, s.faces, s.seam_pairs)
 
     @cached_property
     def _uncorrected(self) -> np.ndarray:
         if self.vertex_image is not None:
             return self.vertex_image
-        return evaluate(self.map, self.source.surface.uv)
+        s = self.source.surface
+        return s.domain.copied(s.uv, s.seam_pairs, evaluate(self.map, s.uv))
 
     @cached_property
     def image_uv(self) -> np.ndarray:
@@ -93,34 +96,44 @@ class SurfaceMap:
     @cached_property
     def certificate(self) -> dict[str, Any]:
         """Whether the map to the target's domain is injective (see :func:`certificate`)."""
-        return certificate(self.target.surface.domain, self.image_uv, self.source.surface.faces)
+        s = self.source.surface
+        return certificate(s.domain, self.image_uv, s.faces, rest=s.uv, copies=s.seam_pairs)
+
+    @property
+    def statement(self) -> str:
+        """What the certificate says, if it holds."""
+        s = self.source.surface
+        return statement(s.domain, seam=len(s.seam_pairs) > 0)
 
     def repaired(self) -> SurfaceMap:
         """The map with its flipped triangles turned back and its boundary put in order, where
         possible; landmarks move only if flips remain otherwise. ``metrics`` are not updated."""
         s = self.source.surface
         held = np.isin(s.source_vertex, s.kept(self.landmarks[:, 0].tolist()))
-        better = repaired(self.target.surface.domain, s.uv, s.faces, self.image_uv, held)
+        better = repaired(s.domain, s.uv, s.faces, self.image_uv, held, s.seam_pairs)
         correction = Correction.between(self.image_uv, better, self.correction)
         return replace(self, correction=correction, vertex_image=self._uncorrected)
 
     @cached_property
     def image(self) -> np.ndarray:
         """Images (V, 3) of the cut source's vertices on the target, in normalised units."""
-        return _lifted(self.target.surface, self.image_uv)
+        return self.target.surface.at(self.image_uv)
 
     @cached_property
     def _forth(self) -> Places:
-        return locate(self.image_uv, self.target.surface.uv, self.target.surface.faces)
+        t = self.target.surface
+        return t.domain.locate(self.image_uv, t.uv, t.faces)
 
     @cached_property
     def _back(self) -> Places:
-        return locate(self.target.surface.uv, self.image_uv, self.source.surface.faces)
+        s, t = self.source.surface, self.target.surface
+        return s.domain.locate(t.uv, self.image_uv, s.faces)
 
     @cached_property
     def source_uv(self) -> np.ndarray:
         """h⁻¹ at the target's vertices (of the cut mesh): (V, 2) in the source's domain."""
-        return self._back.take(self.source.surface.uv, self.source.surface.faces)
+        s, t = self.source.surface, self.target.surface
+        return s.domain.carried(t.uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
 
     def transfer(self, values: np.ndarray, *, back: bool = False) -> np.ndarray:
         """Transfer values at the source's vertices to the target's, or back.
@@ -209,7 +222,7 @@ def load_surface_map(folder: str | Path, trust: Iterable[str] = ()) -> SurfaceMa
     source, target = (load_surface(place / end, trust) for end in ("source", "target"))
     try:
         correction = Correction.taken(tensors, len(source.surface.vertices))
-        h = rotated_map(metadata["map"], tensors, trust)
+        h = placed_map(metadata["map"], tensors, trust)
         landmarks = np.array(metadata["landmarks"], dtype=np.int64).reshape(-1, 2)
         metrics, config = dict(metadata["metrics"]), dict(metadata["config"])
     except DAMAGE as error:
@@ -250,7 +263,3 @@ def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
         around = around[surface.source_vertex[around] >= 0]
         result[vertex] = result[around[0]] if whole else result[around].mean(axis=0)
     return result
-
-
-def _lifted(surface: Surface, uv: np.ndarray) -> np.ndarray:
-    return locate(uv, surface.uv, surface.faces).take(surface.vertices, surface.faces)

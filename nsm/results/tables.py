@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 _ROWS = {
     "rms_percent": ("RMS distance", "% of diagonal"),
@@ -47,6 +48,9 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
     return table
 
 
+# percent of the diagonal by which a seam's sides may part before it is said
+_TORN = 1.0
+
 _PAIR_ROWS = {
     "symmetric_dirichlet_median": ("symmetric Dirichlet, median", "4 at best"),
     "symmetric_dirichlet_mean": ("symmetric Dirichlet, mean", ""),
@@ -64,7 +68,25 @@ _PAIR_ROWS = {
 
 def pair_table(metrics: Mapping[str, float]) -> Table:
     """The main figures of :func:`nsm.results.pair_metrics` with their names and units."""
-    return _figures(metrics, _PAIR_ROWS)
+    return _figures(metrics, _PAIR_ROWS, missing=("landmark_error_max_percent",))
+
+
+def warning_of_tears(name: str, metrics: Mapping[str, float]) -> Text | None:
+    """A line in red, if a map of cut surfaces tears the closed ones; None if it does not.
+
+    Args:
+        name: of the map.
+        metrics: of :func:`nsm.results.pair_metrics`.
+    """
+    largest = metrics.get("seam_gap_max_percent", 0.0)
+    if largest <= _TORN:
+        return None
+    return Text(
+        f"{name}: the surface is torn along its seam, by {largest:.3g} % of the diagonal at worst "
+        f"({metrics['seam_gap_mean_percent']:.3g} % in the mean). Give more landmarks, or, for "
+        "closed surfaces of genus 0 or 1, domain=orbifold or domain=torus, which have no seam",
+        style="bold red",
+    )
 
 
 _COLLECTION_COLUMNS = {
@@ -79,10 +101,13 @@ _COLLECTION_COLUMNS = {
 
 def collection_table(metrics: Mapping[str, Any]) -> Table:
     """The figures of :func:`nsm.results.collection_metrics`, a row for each ordered pair."""
-    table = Table("pair", *_COLLECTION_COLUMNS.values())
+    every = {key for figures in metrics["pairs"].values() for key in figures}
+    columns = {key: label for key, label in _COLLECTION_COLUMNS.items() if key in every}
+    table = Table("pair", *columns.values())
     table.columns[0].no_wrap = True
     for name, figures in metrics["pairs"].items():
-        table.add_row(name, *(f"{figures[key]:.3f}" for key in _COLLECTION_COLUMNS))
+        shown = (_shown(figures, key, "")[0] for key in columns)
+        table.add_row(name, *shown)
     cycle = [metrics[f"cycle_error_{key}_percent"] for key in ("mean", "max")]
     table.caption = f"cycle error: mean {cycle[0]:.2g} %, maximum {cycle[1]:.2g} % of the diagonal"
     return table
@@ -102,10 +127,19 @@ FIGURES: dict[str, tuple[str, str]] = {
 }
 
 
-def _figures(metrics: Mapping[str, float], rows: Mapping[str, tuple[str, str]]) -> Table:
+def _figures(
+    metrics: Mapping[str, float],
+    rows: Mapping[str, tuple[str, str]],
+    missing: Sequence[str] = (),
+) -> Table:
+    """The rows that there are figures for; of the ``missing`` ones, a dash instead."""
     table = Table("figure", "value", "unit")
     table.columns[1].justify = "right"
     for key, (label, unit) in rows.items():
-        if key in metrics:  # a closed domain has no seam to report
-            table.add_row(label, f"{metrics[key]:.3f}", unit)
+        if key in metrics or key in missing:  # a closed domain has no seam to report
+            table.add_row(label, *_shown(metrics, key, unit))
     return table
+
+
+def _shown(metrics: Mapping[str, float], key: str, unit: str) -> tuple[str, str]:
+    return (f"{metrics[key]:.3f}", unit) if key in metrics else ("–", "not measured")

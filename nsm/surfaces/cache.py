@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 # Increase it when the preparation changes: entries of older versions are then ignored.
-PREPARATION_VERSION = 6
+PREPARATION_VERSION = 7
 
 
 def cache_folder() -> Path:

@@ -196,7 +196,7 @@ def _cut_open(
         log = [*log, f"{inserted} interior edges between boundary vertices split"]
     origin = np.concatenate([origin, np.full(inserted, -1)])
     loop = topology.boundary_loops(cut_faces)[0]
-    return Cut(points, cut_faces, origin, _seam_pairs(origin), loop, tuple(log))
+    return Cut(points, cut_faces, origin, seam_pairs(origin), loop, tuple(log))
 
 
 def _almost_closed(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> bool:
@@ -328,7 +328,7 @@ def _split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     return points, np.concatenate([faces[~touched], np.array(new, dtype=np.int64)]), inserted
 
 
-def _seam_pairs(origin: np.ndarray) -> np.ndarray:
+def seam_pairs(origin: np.ndarray) -> np.ndarray:
     """The first copy and each further copy (T, 2) of vertices with the same origin."""
     known = np.flatnonzero(origin >= 0)
     order = known[np.argsort(origin[known], kind="stable")]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Rotated, batched
+from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
@@ -39,7 +39,8 @@ class CollectionMap(ConstrainedMap):
         points: (K, 2) landmarks in the common domain.
         targets: (k, K, 2) the same in each surface's own.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
-        rotations: (k, 2, 2), of the inputs.
+        starts: where each h_i starts, a rotation or, on a closed domain, an affine map: maps around
+            the identity.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
@@ -63,23 +64,24 @@ class CollectionMap(ConstrainedMap):
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
-        rotations: Tensor,
+        starts: Sequence[Rotated | LatticeAligned],
         mesh: tuple[Tensor, Tensor],
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phis", "points", "targets", "seam", "rotations", "mesh"]
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh"]
         self.save_hyperparameters(ignore=given, logger=False)
         onto = domain if self.exact else None
         self.map = nn.ModuleList(
-            Rotated(planar_map(onto, map, activation, encoding), rotation) for rotation in rotations
+            start.around(planar_map(onto, map, activation, encoding)) for start in starts
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
         margin = self.constraints.fold_margin
         self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh, margin=margin) for _ in phis)
-        self.set_landmarks(points, targets, points @ rotations.transpose(1, 2), seam)
+        start = torch.stack([h.before(points) for h in self.map])  # type: ignore[operator]
+        self.set_landmarks(points, targets, start, seam)
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])

@@ -20,7 +20,8 @@ _ON_BOUNDARY = 1e-6
 class ConstrainedMap(Training):
     """Base of the tasks that map surfaces to surfaces.
 
-    With ``constraints.boundary=exact``, h maps Ω to itself by construction; with ``penalty``,
+    With ``constraints.boundary=exact``, or on a closed domain, h maps Ω to itself by construction;
+    with ``penalty``,
     λ_B times the mean squared distance of h(∂Ω) to ∂Ω is added, and samples that h maps out of Ω
     leave the distortion and are pulled back. With ``constraints.landmarks=augmented``, multipliers
     are updated every ``multiplier_every`` steps once the ramp is over (augmented Lagrangian), so
@@ -69,11 +70,16 @@ class ConstrainedMap(Training):
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
         # h maps Ω to itself by construction
-        self.exact = self.constraints.boundary == "exact"
+        self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 
     def set_landmarks(self, points: Tensor, targets: Tensor, start: Tensor, seam: Tensor) -> None:
         """Register landmarks: points (K, 2), their targets and where h has them at its start
-        (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point."""
+        (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point.
+
+        On a closed domain, the targets' lifts nearest to the start are wanted.
+        """
+        lifted = self.domain.lift(targets.flatten(0, -2), start.flatten(0, -2))
+        targets = lifted.view_as(targets)
         given = {"points": points, "targets": targets, "start": start, "seam": seam}
         if not self.exact:
             given["boundary_samples"] = self.domain.boundary_samples()

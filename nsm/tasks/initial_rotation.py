@@ -1,4 +1,5 @@
-"""Where the optimisation of a map starts: the rotation of the source's domain."""
+"""Where the optimisation of a map starts: a rotation of the source's domain, or, on a closed
+domain, an affine map of the lattice."""
 
 from __future__ import annotations
 
@@ -7,7 +8,15 @@ from torch import Tensor, nn
 
 from nsm.domains import Domain
 from nsm.domains import domain as domain_of
+from nsm.domains.orbifold.alignment import Alignment
 from nsm.energies import first_fundamental_form, rotation, symmetric_dirichlet
+from nsm.maps import LatticeAligned
+
+
+def aligned(found: Alignment) -> LatticeAligned:
+    """The start x ↦ Bx + c of an alignment, around the identity."""
+    matrix, shift = (torch.as_tensor(x, dtype=torch.float32) for x in (found.matrix, found.shift))
+    return LatticeAligned(nn.Identity(), matrix, shift)
 
 
 def landmark_rotation(domain: str | Domain, points: Tensor, targets: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nsm.data import Samples
 from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
-from nsm.maps import Composition, Rotated
+from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
@@ -30,7 +30,8 @@ class PairMap(ConstrainedMap):
         points, targets: landmarks P (L, 2) and Q (L, 2) in the domains of source and target.
         seam: (T, 2, 2) pairs of points of ∂Ω that are one point of the source, and whose images
             should be one point of the target.
-        rotation: (2, 2), of h's input (see :mod:`nsm.tasks.initial_rotation`).
+        start: where h starts, a rotation (see :mod:`nsm.tasks.initial_rotation`) or, on a closed
+            domain, an affine map: a map around the identity.
         mesh: uv (V, 2) and faces (F, 3) of the source, whose triangles must not flip.
         diagonal: of the target's bounding box, the unit of the logged errors.
         phi, psi: source and target; neither is trained.
@@ -54,7 +55,7 @@ class PairMap(ConstrainedMap):
         points: Tensor,
         targets: Tensor,
         seam: Tensor,
-        rotation: Tensor,
+        start: Rotated | LatticeAligned,
         mesh: tuple[Tensor, Tensor],
         diagonal: float,
         phi: nn.Module,
@@ -62,16 +63,16 @@ class PairMap(ConstrainedMap):
         loss_terms: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phi", "psi", "points", "targets", "seam", "rotation", "mesh"]
+        given = ["domain", "energy", "phi", "psi", "points", "targets", "seam", "start", "mesh"]
         self.save_hyperparameters(ignore=given, logger=False)
         h = planar_map(domain if self.exact else None, map, activation, encoding)
-        self.map = Rotated(h, rotation)
+        self.map = start.around(h)
         self.phi = phi.eval().requires_grad_(False)
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
         self.fold_barrier = FoldBarrier(*mesh, margin=self.constraints.fold_margin)
         self.diagonal = diagonal
-        self.set_landmarks(points, targets, points @ rotation.T, seam)
+        self.set_landmarks(points, targets, self.map.before(points), seam)
 
     def forward(self, uv: Tensor) -> Tensor:
         """h: (N, 2) points of Ω to (N, 2) in the target's domain."""

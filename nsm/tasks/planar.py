@@ -28,6 +28,9 @@ def planar_map(
             kind="unknown_option",
             key="map.linear_skip",
         )
-    out_dim = 2 if domain is None else domain.network_out_dim
+    out_dim = 2
+    if domain is not None:
+        out_dim = domain.network_out_dim
+        encoding = domain.encoding(encoding, of_map=True)
     network = build_network(map=map, activation=activation, encoding=encoding, out_dim=out_dim)
     return PlanarMap(network) if domain is None else domain.equivariant(network)

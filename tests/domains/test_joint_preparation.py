@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from domains.orbifold.shapes import limbs
+from domains.orbifold.shapes import torus as bent_torus
 
 from nsm.domains import Disc, Square, Surface
 from nsm.domains.common_seams import (
@@ -14,6 +16,7 @@ from nsm.domains.common_seams import (
     seam_costs,
 )
 from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_jointly
+from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths
@@ -217,3 +220,95 @@ def test_meshes_of_another_topology_are_refused_before_any_layout(other):
     with pytest.raises(NsmError) as error:
         prepare_jointly(meshes, [np.arange(3), np.arange(3)], cache=False)
     assert (error.value.kind, error.value.key) == ("wrong_topology", other)
+
+
+# ---------------------------------------------------------------- closed domains
+
+
+@pytest.fixture(scope="module")
+def limbed():
+    """A ball with four limbs and the same stretched; the tips are the landmarks 1, 2, 4 and 6."""
+    points, faces, tips = limbs(3)
+    inner = nearest(points, [[0, 0, 1], [0, 0, -1], [0.6, 0, 0.5], [0, 0.7, 0]])
+    ids = np.array([inner[0], tips[0], tips[1], inner[1], tips[2], inner[2], tips[3], inner[3]])
+    other = points * [1.2, 0.8, 1.1] + 0.1 * np.sin(points[:, ::-1])
+    return [Mesh("one", points, faces), Mesh("other", other, faces)], [ids, ids]
+
+
+TIPS = {1, 2, 4, 6}
+
+
+def test_limbs_become_the_cones(limbed):
+    meshes, ids = limbed
+    numbers, score = choose_common_cones([(m.vertices, m.faces) for m in meshes], ids)
+    assert set(numbers.tolist()) == TIPS
+    assert 1.38 < score < 2.5
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5, 6, 7], [6, 3, 0, 5, 2, 7, 4, 1]])
+def test_the_cones_are_the_same_landmarks_on_all_meshes(limbed, order):
+    meshes, ids = limbed
+    ids = [own[order] for own in ids]
+    surfaces = prepare_jointly(meshes, ids, domain="orbifold", cache=False)
+    matched = matched_landmarks(surfaces, ids)
+    p, q = matched.points
+    assert matched.on_boundary == 0 and matched.numbers.tolist() == list(range(8))
+    np.testing.assert_array_equal(p, surfaces[0].preimages(ids[0]))
+    np.testing.assert_array_equal(q, surfaces[1].preimages(ids[1]))
+    for points in (p, q):
+        at_cones = np.flatnonzero((points == np.rint(points)).all(axis=1))
+        assert {order[k] for k in at_cones} == TIPS
+    np.testing.assert_array_equal(p[at_cones], q[at_cones])
+    for surface in surfaces:
+        assert surface.quality["flipped_triangles"] == 0
+        assert any("cones at landmarks" in line for line in surface.log)
+
+
+def test_surfaces_with_common_cones_are_taken_from_the_cache(limbed):
+    meshes, ids = limbed
+    first = prepare_jointly(meshes, ids, domain="orbifold")
+    second = prepare_jointly(meshes, ids, domain="orbifold")
+    assert "prepared surface taken from the cache" in second[1].log
+    np.testing.assert_array_equal(first[1].uv, second[1].uv)
+    alone = Surface.from_arrays(meshes[1].vertices, meshes[1].faces, domain="orbifold", cache=True)
+    assert "prepared surface taken from the cache" not in alone.log
+
+
+def test_with_fewer_landmarks_each_mesh_has_its_own_cones(limbed):
+    meshes, ids = limbed
+    few = [own[:3] for own in ids]
+    surfaces = prepare_jointly(meshes, few, domain="orbifold", cache=False)
+    for surface, mesh in zip(surfaces, meshes, strict=True):
+        alone = Surface.from_arrays(mesh.vertices, mesh.faces, domain="orbifold")
+        np.testing.assert_array_equal(surface.uv, alone.uv)
+    p, q = matched_landmarks(surfaces, few).points
+    assert p.shape == q.shape == (3, 2)
+
+
+def test_tori_are_laid_out_one_by_one():
+    points, faces = bent_torus()
+    meshes = [Mesh("one", points, faces), Mesh("other", points * [1, 1, 1.3], faces)]
+    ids = [np.array([3, 50, 90, 120, 200])] * 2
+    surfaces = prepare_jointly(meshes, ids, domain="torus", cache=False)
+    p, q = matched_landmarks(surfaces, ids).points
+    assert p.shape == q.shape == (5, 2)
+    for surface in surfaces:
+        assert surface.quality["flipped_triangles"] == 0
+
+
+def test_landmarks_that_coincide_on_a_mesh_count_once():
+    found = distinct([np.array([4, 5, 6, 4, 8]), np.array([1, 2, 3, 4, 2])])
+    assert found.tolist() == [0, 1, 2]
+
+
+def test_other_topology_is_refused_on_closed_domains(limbed):
+    meshes, _ = limbed
+    points, faces = bent_torus()
+    for domain, pair in (
+        ("orbifold", [meshes[0], Mesh("ring", points, faces)]),
+        ("torus", meshes),
+        ("orbifold", [Mesh("ring", points, faces)] * 2),
+    ):
+        with pytest.raises(NsmError) as error:
+            prepare_jointly(pair, [np.arange(5)] * 2, domain=domain, cache=False)
+        assert error.value.kind == "wrong_topology"

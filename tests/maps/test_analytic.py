@@ -26,6 +26,9 @@ EXPRESSIONS = [
 CONFIGS = [{"name": name} for name in ANALYTIC if name != "graph"] + [
     {"name": "graph", "z": z} for z in EXPRESSIONS
 ]
+OVER_THE_DISC = [
+    c for c in CONFIGS if getattr(ANALYTIC[str(c["name"])], "closed_domain", None) is None
+]
 
 
 def disc_points(n=200, seed=0):
@@ -58,7 +61,7 @@ def test_jacobian_agrees_with_finite_differences(config):
     ]
     assert value.shape == (200, 3)
     torch.testing.assert_close(jacobian, torch.stack(ends, dim=-1), rtol=1e-8, atol=1e-8)
-    torch.testing.assert_close(surface(x), value, rtol=0, atol=0)
+    torch.testing.assert_close(surface(x), value, rtol=0, atol=1e-15)
     one_by_one = torch.vmap(lambda p: tuple(t[0] for t in surface.value_and_jacobian(p[None])))(x)
     torch.testing.assert_close(one_by_one, (value, jacobian))
 
@@ -91,7 +94,7 @@ def test_jacobian_is_itself_differentiable(config):
     torch.autograd.gradcheck(lambda p: surface.value_and_jacobian(p)[1], x)
 
 
-@pytest.mark.parametrize("config", CONFIGS, ids=str)
+@pytest.mark.parametrize("config", OVER_THE_DISC, ids=str)
 def test_area_is_that_of_the_disc_unless_asked(config):
     assert polar_area(build_analytic(config)) == pytest.approx(math.pi, rel=2e-4)
     assert polar_area(build_analytic({**config, "area": 2.0})) == pytest.approx(2.0, rel=2e-4)
@@ -277,7 +280,7 @@ def test_any_text_is_a_graph_or_a_plain_refusal(text):
 @pytest.mark.parametrize(
     ("config", "kind", "key"),
     [
-        ({"name": "sphere"}, "unknown_option", "name"),
+        ({"name": "spheroid"}, "unknown_option", "name"),
         ({}, "unknown_option", "name"),
         ({"name": "plane", "colour": 1}, "unknown_setting", "plane"),
         ({"name": "graph"}, "unknown_setting", "graph"),

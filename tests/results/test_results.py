@@ -60,9 +60,11 @@ def square(seam_pairs=()) -> Surface:
     uv = np.stack([x.ravel(), y.ravel()], axis=1)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
-    pairs = np.array(seam_pairs, dtype=np.int64).reshape(-1, 2)
+    origin = np.arange(len(uv))
+    for first, copy in seam_pairs:
+        origin[copy] = first
     vertices = np.column_stack([uv, np.zeros(len(uv))])
-    return as_it_lies("square", vertices, faces, uv, "square", pairs)
+    return as_it_lies("square", vertices, faces, uv, "square", origin=origin)
 
 
 DIAGONAL = np.sqrt(8)

@@ -34,8 +34,10 @@ def height(z):
 def sheet(vertices, seam_pairs=()) -> Surface:
     i = (np.arange(N)[:, None] * (N + 1) + np.arange(N)).ravel()
     halves = [np.stack([i, i + N + 1, i + N + 2], 1), np.stack([i, i + N + 2, i + 1], 1)]
-    pairs = np.array(seam_pairs, dtype=np.int64).reshape(-1, 2)
-    return as_it_lies("sheet", vertices, np.concatenate(halves), UV, "square", pairs)
+    origin = np.arange(len(UV))
+    for first, copy in seam_pairs:
+        origin[copy] = first
+    return as_it_lies("sheet", vertices, np.concatenate(halves), UV, "square", origin=origin)
 
 
 PLANE = sheet(np.column_stack([UV, np.zeros(len(UV))]))

@@ -8,6 +8,7 @@
 | ``tutte``, ``newton``, ``sweeps``, ``collapses``, ``multiresolution`` | the layout: Tutte on a handful of triangles, then descent while the rest is put back |
 | ``certificate`` | whether a map to R²/Γ is a homeomorphism, exactly |
 | ``cover`` | nearest lifts of points, and their places on the mesh |
+| ``repair`` | maps of a surface's copies of vertices made exact, and their flips turned back |
 | ``maps`` | periodic, even and equivariant maps in torch |
 | ``fitting`` | the even periodic spline nearest to a surface |
 """  # noqa: E501

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +17,7 @@ from nsm.errors import NsmError
 from nsm.surfaces import topology
 
 _FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
-_LARGE = 40_000
+LARGE = 40_000
 _FEW = 400  # of the mesh on which all candidates are compared
 _EXTREMITIES = 6
 _CLOSE = 0.12  # of the largest distance: two extremities nearer than this are one
@@ -91,14 +92,15 @@ def score(
     cones: np.ndarray,
     effort: Effort,
     levels: Hierarchy | None = None,
-) -> float:
-    """The area-weighted mean logarithm of the distortion of a mesh laid out with given cones."""
+) -> tuple[float, np.ndarray]:
+    """A mesh laid out with given cones: the mean logarithm of the distortion, weighted by area, and
+    the lattice (2, 2)."""
     lift, _ = cone_lifts(vertices, faces, cones.tolist())
     layout = laid_out(vertices, faces, lift, cones, effort=effort, levels=levels)
     x = layout.uv @ np.linalg.inv(layout.lattice).T
     area = topology.face_areas(vertices, faces)
     value = np.log(distortions(vertices, faces, layout.lift, x, layout.lattice))
-    return float((area * value).sum() / area.sum())
+    return float((area * value).sum() / area.sum()), layout.lattice
 
 
 def choose_cones(
@@ -106,9 +108,8 @@ def choose_cones(
 ) -> tuple[np.ndarray, list[tuple[float, tuple[int, ...]]]]:
     """Four vertices of a closed mesh of genus 0 whose orbifold is little distorted.
 
-    All sets of four of the candidates are laid out on a few hundred faces, the best again on
-    about 3,000. Their cyclic order does not matter while the lattice's shape is free: another
-    order is another basis of the lattice.
+    The cones' cyclic order does not matter while the lattice's shape is free: another order is
+    another basis of the lattice.
 
     Args:
         vertices: (V, 3).
@@ -116,11 +117,12 @@ def choose_cones(
         candidates: (K,) at least four vertices; the extremities if not given.
 
     Returns:
-        the cones (4,), and all scores, best first: mean logarithm of the distortion, and cones.
+        the cones (4,), and the last scores, best first: mean logarithm of the distortion, and
+        cones.
     """
-    if len(faces) > _LARGE:
+    if len(faces) > LARGE:
         # everything below draws the mesh together anew: start from less
-        coarse, ids = decimated(vertices, faces, _LARGE // 2, candidates)
+        coarse, ids = decimated(vertices, faces, LARGE // 2, candidates)
         local = None if candidates is None else np.searchsorted(ids, candidates)
         cones, table = choose_cones(vertices[ids], coarse, local)
         return ids[cones], [(s, tuple(ids[list(four)].tolist())) for s, four in table]
@@ -130,26 +132,52 @@ def choose_cones(
             candidates = _four_apart(vertices, faces, candidates)
     candidates = np.asarray(candidates, dtype=np.int64)
     sets = [np.array(four) for four in combinations(range(len(candidates)), 4)]
-    scores = _scored(vertices, faces, candidates, sets, _FEW, _QUICK)
-    if len(sets) > 1:
-        best = [sets[k] for k in np.argsort(scores)[:_FINALISTS]]
-        again = _scored(vertices, faces, candidates, best, _FACES, _LONGER)
-        sets = [best[k] for k in np.argsort(again)]
-        scores = sorted(again)
-    table = [
-        (s, tuple(int(v) for v in candidates[four])) for s, four in zip(scores, sets, strict=True)
-    ]
+    found = compared([(vertices, faces)], [candidates], sets)
+    table = [(s, tuple(candidates[four].tolist())) for s, four, _ in found]
     return np.array(table[0][1]), table
+
+
+def compared(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]],
+    candidates: Sequence[np.ndarray],
+    sets: Sequence[np.ndarray],
+) -> list[tuple[float, np.ndarray, list[np.ndarray]]]:
+    """Sets of four candidates, by the mean of the meshes' scores, best first.
+
+    All are laid out on a few hundred faces; those returned, the best, again on about 3,000.
+
+    Args:
+        meshes: (V, 3) and (F, 3) of each.
+        candidates: (K,) corresponding vertices of each.
+        sets: which candidates (4,) each has.
+
+    Returns:
+        of each set the mean score, the set, and the meshes' lattices (2, 2).
+    """
+    few, many = (_FEW, _QUICK), (_FACES, _LONGER)
+    found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
+    for count, effort in (few, many) if len(sets) > 1 else (few,):
+        each = [
+            _scored(*mesh, ids, sets, count, effort)
+            for mesh, ids in zip(meshes, candidates, strict=True)
+        ]
+        found = [
+            (float(np.mean([s for s, _ in one])), four, [lattice for _, lattice in one])
+            for four, one in zip(sets, zip(*each, strict=True), strict=True)
+        ]
+        found.sort(key=lambda way: way[0])
+        sets = [four for _, four, _ in found[:_FINALISTS]]
+    return found
 
 
 def _scored(
     vertices: np.ndarray,
     faces: np.ndarray,
     candidates: np.ndarray,
-    sets: list[np.ndarray],
+    sets: Sequence[np.ndarray],
     count: int,
     effort: Effort,
-) -> list[float]:
+) -> list[tuple[float, np.ndarray]]:
     coarse, ids = decimated(vertices, faces, count, candidates)
     local, points = np.searchsorted(ids, candidates), vertices[ids]
     held = np.zeros(len(ids), dtype=bool)
@@ -160,7 +188,7 @@ def _scored(
         try:
             scores.append(score(points, coarse, local[four], effort, levels))
         except NsmError:  # squeezed below what digits hold
-            scores.append(np.inf)
+            scores.append((np.inf, np.eye(2)))
     return scores
 
 

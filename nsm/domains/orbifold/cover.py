@@ -7,7 +7,8 @@ from itertools import product
 import numpy as np
 
 from nsm.domains.orbifold import group
-from nsm.domains.orbifold.embedding import SIDE, Embedding
+from nsm.domains.orbifold.embedding import SIDE, Embedding, reduced_basis
+from nsm.domains.orbifold.repair import isotopy_class
 from nsm.surfaces.location import Places, locate
 
 
@@ -22,39 +23,84 @@ def lifted_near(
         lattice: (2, 2) of an embedding, by whose plane distances are measured; of Ω if not given.
     """
     shape = np.eye(2) if lattice is None else lattice / SIDE
+    basis = reduced_basis(shape)  # in another the nearest lift may be far from the rounded one
+    back = np.rint(np.linalg.inv(basis))
     best = np.empty_like(points, dtype=np.float64)
     least = np.full(len(points), np.inf)
     for sign in (1, -1) if symmetric else (1,):
-        first = sign * points + SIDE * np.rint((near - sign * points) / SIDE)
+        first = np.rint((near - sign * points) @ back.T / SIDE)
         for shift in product((-1, 0, 1), repeat=2):
-            lift = first + SIDE * np.array(shift)
+            lift = sign * points + SIDE * ((first + np.array(shift)) @ basis.T)
             distance = np.linalg.norm((lift - near) @ shape.T, axis=1)
             closer = distance < least
             best[closer], least[closer] = lift[closer], distance[closer]
     return best
 
 
-def triangles_over_domain(corners: np.ndarray, symmetric: bool) -> tuple[np.ndarray, np.ndarray]:
-    """All lifts of triangles (F, 3, 2) that meet the fundamental domain: (K, 3, 2), faces (K,)."""
+def triangles_over_domain(
+    corners: np.ndarray, symmetric: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All lifts of triangles (F, 3, 2) that meet the fundamental domain.
+
+    Returns:
+        the lifts (K, 3, 2), their faces (K,), and the elements (K, 3) of the group that move each
+        face there.
+    """
+    _, home = group.into_domain(corners.mean(axis=1) / SIDE, symmetric)
+    corners = SIDE * group.moved(home[:, None], corners / SIDE)
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
-    parts, numbers = [], []
-    for sign, m, n in product((1, -1) if symmetric else (1,), (-1, 0, 1), (-1, 0, 1)):
-        moved = sign * corners + SIDE * np.array([m, n])
-        meets = (moved.max(axis=1) >= low).all(axis=1) & (moved.min(axis=1) <= 1.0).all(axis=1)
-        parts.append(moved[meets])
-        numbers.append(np.flatnonzero(meets))
-    return np.concatenate(parts), np.concatenate(numbers)
+    parts, numbers, elements = [], [], []
+    for sign in (1, -1) if symmetric else (1,):
+        least, most = (sign * corners).min(axis=1), (sign * corners).max(axis=1)
+        first = np.ceil((low - most.max(axis=0)) / SIDE).astype(int)
+        last = np.floor((1.0 - least.min(axis=0)) / SIDE).astype(int)
+        for shift in product(*(range(a, b + 1) for a, b in zip(first, last, strict=True))):
+            by = SIDE * np.array(shift)
+            meets = (most + by >= low).all(axis=1) & (least + by <= 1.0).all(axis=1)
+            parts.append(sign * corners[meets] + by)
+            numbers.append(np.flatnonzero(meets))
+            elements.append(group.compose(np.array([sign, *shift]), home[meets]))
+    return np.concatenate(parts), np.concatenate(numbers), np.concatenate(elements)
 
 
 def located(embedding: Embedding, points: np.ndarray) -> Places:
     """Where points (N, 2) of Ω, in any lift, lie on the mesh: faces and barycentric weights."""
-    return located_on(embedding.corners(), points, embedding.cones is not None)
+    return located_on(embedding.corners(), points, embedding.cones is not None)[0]
 
 
-def located_on(corners: np.ndarray, points: np.ndarray, symmetric: bool) -> Places:
-    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift near the domain."""
-    x, _ = group.into_domain(points / SIDE, symmetric)
-    corners, number = triangles_over_domain(corners, symmetric)
+def located_on(
+    corners: np.ndarray, points: np.ndarray, symmetric: bool
+) -> tuple[Places, np.ndarray]:
+    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift; and the elements
+    (N, 3) of the group that move each point's triangle to where the point is."""
+    x, back = group.into_domain(points / SIDE, symmetric)
+    corners, number, element = triangles_over_domain(corners, symmetric)
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     found = locate(SIDE * x, corners.reshape(-1, 2), faces)
-    return Places(number[found.face], found.weights)
+    there = group.compose(group.inverse(back), element[found.face])
+    return Places(number[found.face], found.weights), there
+
+
+def carried(
+    points: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    faces: np.ndarray,
+    copies: np.ndarray,
+    symmetric: bool,
+) -> np.ndarray:
+    """Images (N, 2), in the cover, of points (N, 2) under an equivariant map linear on triangles.
+
+    Args:
+        points: in any lift.
+        before, after: (V, 2) the vertices and their images.
+        faces: (F, 3), each triangle in one lift.
+        copies: (T, 2) vertices that are lifts of one point.
+        symmetric: whether x and -x are one point: the orbifold.
+    """
+    places, element = located_on(before[faces], points, symmetric)
+    value = places.take(after, faces)
+    matrix, shift = isotopy_class(before, copies, after, symmetric)
+    sign, moves = element[:, :1], element[:, 1:] * SIDE
+    # h(γx) = γ'h(x): for γ = (x ↦ sx + k), γ' is y ↦ sy + Bk + (1 - s)c
+    return sign * value + moves @ matrix.T + (1 - sign) * shift

@@ -19,12 +19,14 @@ import numpy as np
 
 from nsm.domains import planar_mesh
 from nsm.domains.base import Domain
-from nsm.domains.orbifold.cover import located_on
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.cover import carried, located_on
 from nsm.domains.orbifold.embedding import SIDE, Embedding, embed_orbifold, embed_torus
+from nsm.domains.orbifold.quotient_mesh import quotient_mesh
+from nsm.domains.orbifold.repair import copied, repaired, torn
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.location import Places
-from nsm.surfaces.shapes import grid_mesh
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -82,33 +84,55 @@ class ClosedDomain(Domain):
             key="domain",
         )
 
-    def certificate(self, uv: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    def certificate(
+        self,
+        image: np.ndarray,
+        faces: np.ndarray,
+        *,
+        rest: np.ndarray | None = None,
+        copies: np.ndarray | None = None,
+    ) -> dict[str, Any]:
         """As :meth:`Domain.certificate`; each triangle in one lift, as those of a surface are.
 
-        ``degree`` says how often Ω is covered; it should be one.
+        ``torn_vertices`` are copies of a vertex that do not have one image; ``degree_error`` says
+        how many times too often or too rarely Ω is covered. If all is zero, the map is a
+        homeomorphism of Ω.
         """
-        flipped = int(planar_mesh.flipped(uv, faces).sum())
+        flipped = int(planar_mesh.flipped(image, faces).sum())
         whole = SIDE**2 / (2 if self.even else 1)  # Ω's area in its own coordinates
-        degree = float(planar_mesh.signed_areas(uv, faces).sum() / whole)
-        return {
-            "certified": flipped == 0 and abs(degree - 1) < 1e-6,
-            "flipped_triangles": flipped,
-            "degree": degree,
-        }
+        degree = float(planar_mesh.signed_areas(image, faces).sum() / whole)
+        wrong = abs(round(degree) - 1) if abs(degree - round(degree)) < 1e-6 else 1
+        counts = {"flipped_triangles": flipped, "torn_vertices": 0, "degree_error": wrong}
+        if rest is not None and copies is not None:
+            counts["torn_vertices"] = torn(rest, copies, image, self.even)
+        return {"certified": not any(counts.values()), **counts}
 
     def repaired(
-        self, rest: np.ndarray, faces: np.ndarray, image: np.ndarray, held: np.ndarray
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        image: np.ndarray,
+        held: np.ndarray,
+        copies: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Not available: maps of closed domains are not repaired.
+        """As :meth:`Domain.repaired`: in the cover, all copies of a vertex together."""
+        pairs = np.zeros((0, 2), dtype=np.int64) if copies is None else copies
+        return repaired(rest, faces, pairs, image, held, self.even)
 
-        Raises:
-            NsmError: ``wrong_domain``.
-        """
-        raise NsmError(
-            f"domain={self} has no repair of maps; take domain=disc",
-            kind="wrong_domain",
-            key="domain",
-        )
+    def copied(self, rest: np.ndarray, copies: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """As :meth:`Domain.copied`."""
+        return copied(rest, copies, image, self.even)
+
+    def carried(
+        self,
+        points: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
+        faces: np.ndarray,
+        copies: np.ndarray,
+    ) -> np.ndarray:
+        """As :meth:`Domain.carried`."""
+        return carried(points, before, after, faces, copies, self.even)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Mask (...) of the points (..., 2) of the fundamental domain."""
@@ -116,7 +140,11 @@ class ClosedDomain(Domain):
 
     def locate(self, points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Places:
         """The places of points (N, 2), in any lift, on a mesh laid out over Ω."""
-        return located_on(uv[faces], points, self.even)
+        return located_on(uv[faces], points, self.even)[0]
+
+    def canonical(self, points: np.ndarray) -> np.ndarray:
+        """As :meth:`Domain.canonical`."""
+        return SIDE * group.into_domain(points / SIDE, self.even)[0]
 
     def lift(self, points: Tensor, near: Tensor) -> Tensor:
         """The lifts of points (N, 2) nearest to others (N, 2), in coordinates of Ω."""
@@ -143,28 +171,46 @@ class ClosedDomain(Domain):
 
     def mesh(self, rings: int = 60) -> tuple[np.ndarray, np.ndarray]:
         """A grid of points (V, 2) of the fundamental domain, and triangles (F, 3)."""
-        points, faces = grid_mesh(2 * rings)
-        low = np.array(self.low)
-        return low + (1 - low) * 0.5 * (points + 1), faces
+        return self.closed_mesh(rings)[:2]
+
+    def closed_mesh(
+        self, rings: int = 60, lattice: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As :meth:`mesh`, and the vertex (V,) that each point is a copy of.
+
+        Args:
+            rings: there are about (2 rings)² cells.
+            lattice: (2, 2), in whose plane cells are nearly square; square by default.
+        """
+        across, along = (1.0, 1.0) if lattice is None else np.linalg.norm(lattice, axis=0)
+        halves = 2 if self.even else 1
+        columns = 2 * rings * math.sqrt(halves * across / along)
+        rows = 2 * rings * math.sqrt(along / across / halves)
+        return quotient_mesh(columns, rows, self.even)
 
     def encoding(
-        self, settings: Mapping[str, Any], lattice: np.ndarray | None = None
+        self,
+        settings: Mapping[str, Any],
+        lattice: np.ndarray | None = None,
+        *,
+        of_map: bool = False,
     ) -> dict[str, Any]:
         """Settings of the spline grid with Ω's symmetries that stands for one on the plane.
 
-        Its tables are as large as those of a grid of the same ``resolutions``, r² cells on Ω;
-        cells are nearly square in the plane of the surface's lattice.
+        It has r² cells on Ω, as many as a grid of the same ``resolutions``; cells are nearly square
+        in the plane of the surface's lattice.
 
         Args:
             settings: of :class:`nsm.maps.SplineGrid`, or of such a grid already.
             lattice: (2, 2) of the surface; square by default.
+            of_map: for the network of :meth:`equivariant`: periodic, but not even.
 
         Raises:
             NsmError: ``wrong_domain`` for any other encoding.
         """
         target = str(settings.get("_target_"))
         if target.endswith(".LatticeSplineGrid"):
-            return dict(settings)
+            return {**settings, "even": self.even and not of_map}
         if target not in _GRIDS or settings.get("degree", 2) != 2:
             raise NsmError(
                 f"setting encoding: domain={self} needs encoding=spline_grid of degree 2, which it "
@@ -182,7 +228,8 @@ class ClosedDomain(Domain):
             step = max(4, 2 ** int(math.log2(max(resolution, 16) / 16)))
             levels.append([max(1, round(side * f / step)) * step for f in (aspect, 1 / aspect)])
         grid = {"_target_": "nsm.maps.lattice_grid.LatticeSplineGrid", "resolutions": levels}
-        return {**grid, "features": settings.get("features", 4), "even": self.even}
+        even = self.even and not of_map
+        return {**grid, "features": settings.get("features", 4), "even": even}
 
     def symmetric(self, network: nn.Module) -> nn.Module:
         """A surface φ over Ω: the network itself, whose encoding has the symmetries.
@@ -231,10 +278,9 @@ class Orbifold(ClosedDomain):
 
     def equivariant(self, network: nn.Module) -> nn.Module:
         """h(x) = x + ½(n(x) - n(-x)) around a periodic network n."""
-        from nsm.domains.orbifold.maps import EquivariantMap
-        from nsm.maps import PlanarMap
+        from nsm.maps import EquivariantMap
 
-        return EquivariantMap(PlanarMap(network).network)
+        return EquivariantMap(network)
 
 
 @dataclass(frozen=True)
@@ -268,7 +314,6 @@ class Torus(ClosedDomain):
 
     def equivariant(self, network: nn.Module) -> nn.Module:
         """h(x) = x + n(x) around a periodic network n."""
-        from nsm.domains.orbifold.maps import TorusMap
-        from nsm.maps import PlanarMap
+        from nsm.maps import TorusMap
 
-        return TorusMap(PlanarMap(network).network)
+        return TorusMap(network)

@@ -83,7 +83,7 @@ class Embedding:
             turned = np.isin(self.faces, self.cones) & (element[..., 0] < 0)
             element[turned, 1:] -= x[self.faces[turned]]
             element[turned, 0] = 1
-        reach = 2 * int(np.abs(element[..., 1:]).max()) + 1
+        reach = 2 * int(np.abs(element[..., 1:]).max()) + 2
         s, m, n = np.moveaxis(element, -1, 0)
         code = ((s < 0) * reach + np.abs(m) * 2 + (m < 0)) * reach + np.abs(n) * 2 + (n < 0)
         number = self.faces * (2 * reach * reach) + code  # the identity is the least of a vertex

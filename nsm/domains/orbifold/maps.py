@@ -1,7 +1,6 @@
-"""Maps that respect the symmetry of Ω = R²/Γ: periodic, even and equivariant, by construction.
+"""Functions that respect the symmetry of Ω = R²/Γ: periodic and even, by construction.
 
-The lattice is 2Z x 2Z. On the orbifold, a function φ of R²/Γ is periodic and even,
-φ(x + 2k) = φ(x) = φ(-x); a map h of it to itself is equivariant, h(γx) = γh(x) for all γ in Γ.
+The lattice is 2Z x 2Z. On the orbifold, a function φ of R²/Γ has φ(x + 2k) = φ(x) = φ(-x).
 """
 
 from __future__ import annotations
@@ -173,63 +172,3 @@ class EvenMap(nn.Module):
             value, column = torch.func.jvp(self.network, (features,), (jacobian[..., k],))[:2]
             columns.append(column)
         return value, torch.stack(columns, dim=-1)
-
-
-class EquivariantMap(nn.Module):
-    """h(x) = x + (n(x) - n(-x)) / 2, n periodic: a map of the orbifold to itself.
-
-    h(γx) = γh(x) for all γ in Γ, so h is continuous, has degree one and keeps the four cones;
-    det J_h > 0 everywhere makes it a homeomorphism.
-
-    Args:
-        displacement: n, a periodic module from (..., 2) to (..., 2); zero at the start gives the
-            identity.
-    """
-
-    def __init__(self, displacement: nn.Module) -> None:
-        super().__init__()
-        self.displacement = displacement
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Points (..., 2) to points (..., 2), in the cover."""
-        value: Tensor = x + 0.5 * (self.displacement(x) - self.displacement(-x))
-        return value
-
-    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(..., 2) and (..., 2, 2)."""
-        here, by_here = _value_and_jacobian(self.displacement, x)
-        there, by_there = _value_and_jacobian(self.displacement, -x)
-        one = torch.eye(2, dtype=x.dtype, device=x.device)
-        return x + 0.5 * (here - there), one + 0.5 * (by_here + by_there)
-
-
-class TorusMap(nn.Module):
-    """h(x) = A x + n(x), n periodic and A in SL(2, Z): a map of the torus to itself of degree one.
-
-    Args:
-        displacement: n, a periodic module from (..., 2) to (..., 2).
-        matrix: A, integers ((a, b), (c, d)) with ad - bc = 1: the isotopy class.
-    """
-
-    matrix: Tensor
-
-    def __init__(
-        self, displacement: nn.Module, matrix: tuple[_Pair, _Pair] = ((1, 0), (0, 1))
-    ) -> None:
-        super().__init__()
-        (a, b), (c, d) = matrix
-        if a * d - b * c != 1:
-            raise ValueError(f"matrix must have determinant 1, not {a * d - b * c}")
-        self.displacement = displacement
-        self.register_buffer("matrix", torch.tensor(matrix, dtype=torch.get_default_dtype()))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Points (..., 2) to points (..., 2), in the cover."""
-        value: Tensor = x @ self.matrix.to(x.dtype).T + self.displacement(x)
-        return value
-
-    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(..., 2) and (..., 2, 2)."""
-        value, jacobian = _value_and_jacobian(self.displacement, x)
-        matrix = self.matrix.to(x.dtype)
-        return x @ matrix.T + value, matrix + jacobian

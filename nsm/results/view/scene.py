@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -49,6 +50,7 @@ class Shape:
             file, or the new coordinates of a flattening.
         seam_pairs: (T, 2) copies of the same vertex of the uncut mesh.
         landmarks: (L,) vertices.
+        closed: the mesh was not cut; copies of a vertex are lifts of it.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Shape:
     coordinates: np.ndarray
     seam_pairs: np.ndarray
     landmarks: np.ndarray = field(default_factory=lambda: _NO_VERTICES)
+    closed: bool = False
 
     @cached_property
     def _uncut(self) -> np.ndarray:
@@ -69,6 +72,8 @@ class Shape:
     @cached_property
     def seam(self) -> np.ndarray:
         """The edges (E, 2) along which the mesh was cut, each once."""
+        if self.closed:
+            return np.zeros((0, 2), dtype=np.int64)
         edges = edges_of(self.faces)
         boundary = edges.pairs[edges.count == 1]
         uncut = np.sort(self._uncut[boundary], axis=1)
@@ -118,6 +123,7 @@ class Scene:
         checkerboards: for each name, coordinates (V, 2) of the source's vertices in [-1, 1]².
         energies: for each name, values (F,) on the source's triangles.
         errors: for each name, values (V,) at its vertices.
+        locate: where points (N, 2) of the target's domain lie on a mesh over it: uv (V, 2), faces.
     """
 
     source: Shape
@@ -128,6 +134,7 @@ class Scene:
     checkerboards: dict[str, np.ndarray]
     energies: dict[str, np.ndarray]
     errors: dict[str, np.ndarray] = field(default_factory=dict)
+    locate: Callable[[np.ndarray, np.ndarray, np.ndarray], Places] = locate
 
     @property
     def shapes(self) -> tuple[Shape, Shape]:
@@ -140,7 +147,7 @@ class Scene:
 
     @cached_property
     def _preimages(self) -> Places:
-        return locate(self.target.uv, self.image_uv, self.source.faces)
+        return self.locate(self.target.uv, self.image_uv, self.source.faces)
 
     def transferred(self, values: np.ndarray) -> np.ndarray:
         """Values (V, ...) at the source's vertices, transferred to the target's (W, ...)."""
@@ -150,9 +157,9 @@ class Scene:
         """The points of the other shape that correspond to places on one (0: the source)."""
         if side == 0:
             uv = places.take(self.image_uv, self.source.faces)
-            return locate(uv, self.target.uv, self.target.faces)
+            return self.locate(uv, self.target.uv, self.target.faces)
         uv = places.take(self.target.uv, self.target.faces)
-        return locate(uv, self.image_uv, self.source.faces)
+        return self.locate(uv, self.image_uv, self.source.faces)
 
     def morph(self, t: float) -> np.ndarray:
         """The source's vertices (V, 3) moved straight towards their images, t from 0 to 1."""
@@ -246,7 +253,9 @@ def _overfit(neural: NeuralSurface, frame: np.ndarray) -> Scene:
     target = _file_shape(f"{s.name}: neural surface", neural, image - centre, image)
     checkerboards = {"checkerboard of the domain": s.uv}
     energies = _energies(s, image)
-    return Scene(source, target, s.uv, target.vertices, frame, checkerboards, energies, errors)
+    locate = s.domain.locate
+    shown = (source, target, s.uv, target.vertices, frame)
+    return Scene(*shown, checkerboards, energies, errors, locate)
 
 
 def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
@@ -272,7 +281,9 @@ def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
     target = _file_shape(t.name, f.target, turned - centre, t.vertices, f.landmarks[:, 1])
     checkerboards = {"checkerboard of the source": s.uv, "checkerboard of the target": f.image_uv}
     image = f.aligned_image - centre
-    return Scene(source, target, f.image_uv, image, frame, checkerboards, _energies(s, f.image))
+    energies, locate = _energies(s, f.image), s.domain.locate
+    shown = (source, target, f.image_uv, image, frame)
+    return Scene(*shown, checkerboards, energies, locate=locate)
 
 
 def _file_shape(
@@ -285,7 +296,8 @@ def _file_shape(
     """A surface of a mesh file, with landmarks (L,) as vertices of the uncut mesh."""
     s = neural.surface
     coordinates = neural.in_original_units(vertices)
-    return Shape(name, shown, s.faces, s.uv, coordinates, s.seam_pairs, s.cut_vertex[landmarks])
+    closed, marked = not s.domain.has_boundary, s.cut_vertex[landmarks]
+    return Shape(name, shown, s.faces, s.uv, coordinates, s.seam_pairs, marked, closed)
 
 
 def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:

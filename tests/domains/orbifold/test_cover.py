@@ -9,8 +9,9 @@ from domains.orbifold.shapes import limbs, torus
 
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.cover import lifted_near, located, triangles_over_domain
-from nsm.domains.orbifold.embedding import Embedding, embed_orbifold, embed_torus
-from nsm.domains.orbifold.maps import EquivariantMap, PeriodicSplineGrid, TorusMap
+from nsm.domains.orbifold.embedding import Embedding, embed_orbifold, embed_torus, twisted
+from nsm.domains.orbifold.maps import PeriodicSplineGrid
+from nsm.maps import EquivariantMap, LatticeAligned, TorusMap
 
 
 @pytest.fixture(scope="module", params=["orbifold", "torus"])
@@ -52,11 +53,43 @@ def test_points_are_located(embedding: Embedding) -> None:
         np.testing.assert_allclose(lifted_near(there, points, symmetric), points, atol=1e-7)
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_the_nearest_lift_in_a_sheared_basis(symmetric: bool) -> None:
+    """Against all lifts that are not far, for lattices whose basis is far from reduced."""
+    rng = np.random.default_rng(2)
+    shift = 2 * np.stack(np.meshgrid(*[np.arange(-12, 13)] * 2), axis=-1).reshape(-1, 2)
+    for _ in range(5):
+        lattice = rng.normal(size=(2, 2)) @ np.array([[1, 3], [1, 4]])
+        points, near = rng.uniform(-1, 1, (2, 30, 2))
+        found = lifted_near(points, near, symmetric, lattice)
+        lifts = points[:, None] + shift
+        if symmetric:
+            lifts = np.concatenate([lifts, -lifts], axis=1)
+        gaps = np.linalg.norm((lifts - near[:, None]) @ lattice.T / 2, axis=2).min(axis=1)
+        mine = np.linalg.norm((found - near) @ lattice.T / 2, axis=1)
+        np.testing.assert_allclose(mine, gaps, atol=1e-9)
+
+
+def test_lifts_of_long_triangles_cover_the_domain(embedding: Embedding) -> None:
+    """Laid out in a sheared basis, triangles reach over several copies of the domain."""
+    sheared = twisted(embedding, np.array([[9, 4], [2, 1]]))
+    points, _ = _anywhere(embedding)
+    places = located(sheared, points)
+    there = np.einsum("nk,nki->ni", places.weights, sheared.corners()[places.face])
+    symmetric = embedding.cones is not None
+    np.testing.assert_allclose(lifted_near(there, points, symmetric), points, atol=1e-7)
+
+
 def test_lifts_cover_the_domain(embedding: Embedding) -> None:
-    corners, _ = triangles_over_domain(embedding.corners(), embedding.cones is not None)
+    corners, _, _ = triangles_over_domain(embedding.corners(), embedding.cones is not None)
     b, c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]).sum()
     assert area >= (2 if embedding.cones is not None else 4)
+
+
+def _twisted(displacement: torch.nn.Module) -> LatticeAligned:
+    matrix = torch.tensor([[2.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+    return LatticeAligned(TorusMap.around(displacement), matrix, torch.zeros(2).double())
 
 
 def test_small_equivariant_maps_are_certified(embedding: Embedding) -> None:
@@ -64,12 +97,12 @@ def test_small_equivariant_maps_are_certified(embedding: Embedding) -> None:
     displacement = PeriodicSplineGrid([4], 2, scale=0.02).double()
     if embedding.cones is not None:
         maps: list[tuple[torch.nn.Module, np.ndarray | None]] = [
-            (EquivariantMap(displacement), None)
+            (EquivariantMap.around(displacement), None)
         ]
     else:
         maps = [
-            (TorusMap(displacement), None),
-            (TorusMap(displacement, ((2, 1), (1, 1))), np.array([[2, 1], [1, 1]])),
+            (TorusMap.around(displacement), None),
+            (_twisted(displacement), np.array([[2, 1], [1, 1]])),
         ]
     for h, matrix in maps:
         with torch.no_grad():

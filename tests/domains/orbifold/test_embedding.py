@@ -7,6 +7,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 from domains.orbifold.shapes import limbs, torus
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from nsm.domains.orbifold.certificate import torn_edges
@@ -107,6 +109,26 @@ def test_twists_are_other_classes(embedded: tuple[np.ndarray, Embedding, list[in
     with pytest.raises(NsmError) as error:
         twisted(embedding, np.array([[1, 1], [0, 1]]))
     assert error.value.kind == "out_of_range"
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_copies_lie_where_the_corners_do(
+    embedded: tuple[np.ndarray, Embedding, list[int]], seed: int
+) -> None:
+    """In whatever layout: different lifts of a vertex are different copies."""
+    rng = np.random.default_rng(seed)
+    _, embedding, _ = embedded
+    assert embedding.cones is not None
+    embedding = in_order(embedding, rng.permutation(embedding.cones).tolist())
+    for _ in range(rng.integers(4)):
+        k = int(rng.choice([-2, 2]))
+        embedding = twisted(embedding, np.array([[[1, k], [0, 1]], [[1, 0], [k, 1]]][k // 2]))
+    origin, uv, faces = embedding.copies()
+    np.testing.assert_allclose(uv[faces], embedding.corners(), atol=1e-12)
+    np.testing.assert_array_equal(origin[faces], embedding.faces)
+    np.testing.assert_array_equal(origin[: len(embedding.uv)], np.arange(len(embedding.uv)))
+    assert len(np.unique(np.column_stack([origin, uv.round(9)]), axis=0)) == len(origin)
 
 
 def test_what_is_broken_is_noticed(embedded: tuple[np.ndarray, Embedding, list[int]]) -> None:

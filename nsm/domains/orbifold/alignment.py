@@ -1,0 +1,284 @@
+"""Isotopy classes of maps between closed surfaces laid out on Ω = R²/Γ, and the best of them.
+
+A homeomorphism of Ω lifts to h(x) = g(B x + c), where g commutes with Γ, B is in SL(2, Z), and
+x ↦ B x + c takes Γ to itself. On the orbifold c is an integer vector, B and c count modulo Γ (up to
+one sign, and c modulo 2), and the classes are those of homeomorphisms that permute the cones: B and
+c modulo 2 tell the cones' order, the rest of B the paths between them; a wrong one is a Dehn twist.
+On the torus c is any vector, since translations do not change the class (Farb and Margalit, "A
+Primer on Mapping Class Groups", sections 2.2.4 and 2.2.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.cover import lifted_near, triangles_over_domain
+from nsm.domains.orbifold.domain import ClosedDomain
+from nsm.domains.orbifold.embedding import SIDE, reduced_basis
+from nsm.domains.surface import Surface
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+
+Landmarks = tuple[np.ndarray, np.ndarray]
+
+_ENTRIES = 9  # largest entry of a class in reduced bases of both lattices
+_CLASSES = 192  # maps whose lattices differ least, that are looked at
+_FEW, _MANY = 300, 2500  # triangles of the source, for all of them and for the best
+_FINALISTS = 12
+_SHIFTS = 8  # per axis, of a torus without landmarks
+_HALVINGS = 4  # of the step between them, around the best
+_EPSILON = 0.01  # METHOD Eq. 2
+_WORST = 1e3  # upper bound on a triangle's distortion
+# weight of the landmarks' distances, in the unit in which a disc of Ω's area has the radius 1,
+# beside the logarithm of the distortion
+_MISS = 3.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The map x ↦ B x + c of Ω, with which a map of an isotopy class begins.
+
+    Attributes:
+        matrix: B (2, 2), integers with determinant 1.
+        shift: c (2,), 0 or 1 on the orbifold; in [-1, 1) on the torus.
+        distortion: mean logarithm of the symmetric Dirichlet energy of the map from the source
+            to the target, weighted by area; each triangle counts 1,000 at most.
+        miss: root mean square distance, in the plane of the target's lattice, of landmarks from
+            the target's nearest ones.
+        score: what alignments are compared by; the least is best.
+    """
+
+    matrix: np.ndarray
+    shift: np.ndarray
+    distortion: float
+    miss: float
+
+    @property
+    def score(self) -> float:
+        return self.distortion + _MISS * self.miss
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """B x + c at points (N, 2) of Ω."""
+        return points @ self.matrix.T + self.shift
+
+    @property
+    def inverse(self) -> Alignment:
+        """The map back, x ↦ B⁻¹(x - c), with the same figures."""
+        back = np.rint(np.linalg.inv(self.matrix)).astype(np.int64)
+        return replace(self, matrix=back, shift=-back @ self.shift)
+
+    def lifted(self, points: np.ndarray, targets: np.ndarray, target: Surface) -> np.ndarray:
+        """Of the lifts of target points (L, 2) those (L, 2) nearest to the images of points (L, 2).
+
+        Distances are those in the plane of the target's lattice.
+        """
+        return lifted_near(targets, self(points), _domain(target).even, target.lattice)
+
+
+def alignments(
+    source: Surface, target: Surface, landmarks: Landmarks | None = None
+) -> list[Alignment]:
+    """The likely isotopy classes of maps from one closed surface to another, best first.
+
+    Of all maps x ↦ B x + c that keep Γ those are compared for which the two lattices differ least
+    (by the singular values of L_t B L_s⁻¹), by distortion and by how far they miss the landmarks. A
+    landmark that is a cone of both surfaces must go to itself. On the torus, c is where the
+    landmarks are missed least, or, without landmarks, where the distortion is least.
+
+    Args:
+        source, target: on the same closed domain.
+        landmarks: corresponding vertices (L,) of each mesh file, if any.
+
+    Raises:
+        NsmError: ``wrong_domain`` for surfaces of another domain; ``not_on_surface`` for a
+            landmark that a surface does not have.
+    """
+    domain = _domain(source)
+    if _domain(target) != domain:
+        raise NsmError(
+            f"{source.name} lies on the {source.domain}, {target.name} on the {target.domain}; "
+            "a map needs one domain",
+            kind="wrong_domain",
+            key=target.name,
+        )
+    if landmarks is None:
+        p = q = np.zeros((0, 2))
+    else:
+        p, q = (s.preimages(i.tolist()) for s, i in zip((source, target), landmarks, strict=True))
+    pair = _Pair(source, target, p, q)
+    found = _candidates(source, target)
+    if domain.even:
+        cone = np.logical_and(*((x == np.rint(x)).all(axis=1) for x in (p, q)))
+        classes = [
+            (b, np.array(c, dtype=float))
+            for b in found
+            for c in product((0, 1), repeat=2)
+            if (np.mod(p[cone] @ b.T + c - q[cone], 2) == 0).all()
+        ][:_CLASSES]
+    elif len(p):
+        classes = [(b, pair.mean_shift(b)) for b in found[: _CLASSES // 4]]
+    else:
+        classes = pair.best_shifts(found[: _CLASSES // 16])
+    first = sorted((pair.alignment(b, c, _FEW) for b, c in classes), key=lambda a: a.score)
+    best = [pair.alignment(a.matrix, a.shift, _MANY) for a in first[:_FINALISTS]]
+    return sorted(best, key=lambda a: a.score)
+
+
+def alignments_to_first(
+    surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray] | None = None
+) -> list[Alignment]:
+    """The best alignment of each surface of a collection to the first; the first's is the identity.
+
+    Args:
+        surfaces: on the same closed domain.
+        landmarks: corresponding vertices (L,) of each mesh file, if any.
+
+    Raises:
+        NsmError: as :func:`alignments`.
+    """
+    first = [Alignment(np.eye(2, dtype=np.int64), np.zeros(2), float(np.log(_least())), 0.0)]
+    for k, surface in enumerate(surfaces[1:], start=1):
+        common = None if landmarks is None else (landmarks[k], landmarks[0])
+        first.append(alignments(surface, surfaces[0], common)[0])
+    return first
+
+
+def _least() -> float:
+    """The energy of an isometry."""
+    return 2 + 2 / (1 + _EPSILON)
+
+
+def _domain(surface: Surface) -> ClosedDomain:
+    if not isinstance(surface.domain, ClosedDomain) or surface.lattice is None:
+        raise NsmError(
+            f"{surface.name} lies on the {surface.domain}, which has no isotopy classes; take "
+            "domain=orbifold or domain=torus",
+            kind="wrong_domain",
+            key=surface.name,
+        )
+    return surface.domain
+
+
+def _candidates(source: Surface, target: Surface) -> list[np.ndarray]:
+    """Matrices B (2, 2) of SL(2, Z), one of each pair ±B on the orbifold, that change the lattices'
+    shapes least, in the order of the larger singular value of L_t B L_s⁻¹."""
+    assert source.lattice is not None and target.lattice is not None
+    bases = [reduced_basis(s.lattice) for s in (source, target) if s.lattice is not None]
+    one, other = source.lattice @ bases[0], target.lattice @ bases[1]
+    entries = np.arange(-_ENTRIES, _ENTRIES + 1)
+    column = np.stack(np.meshgrid(entries, entries, indexing="ij"), axis=-1).reshape(-1, 2)
+    first, second = (i.ravel() for i in np.meshgrid(*[np.arange(len(column))] * 2, indexing="ij"))
+    a, b = column[first], column[second]
+    unit = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] == 1
+    matrix = np.stack([a[unit], b[unit]], axis=2)
+    if _domain(source).even:
+        flat = matrix.reshape(-1, 4)
+        leading = flat[np.arange(len(flat)), (flat != 0).argmax(axis=1)]
+        matrix = matrix[leading > 0]
+    change = other @ matrix @ np.linalg.inv(one)
+    # determinant 1: the sum of squares orders as the larger singular value does
+    order = np.argsort((change**2).sum(axis=(1, 2)).round(9), kind="stable")
+    back = np.rint(np.linalg.inv(bases[0])).astype(np.int64)
+    return [bases[1] @ m @ back for m in matrix[order]]
+
+
+class _Pair:
+    """Two surfaces, and what their maps x ↦ B x + c are judged by."""
+
+    def __init__(self, source: Surface, target: Surface, p: np.ndarray, q: np.ndarray) -> None:
+        import igl
+
+        self.source, self.target, self.p, self.q = source, target, p, q
+        self.even = _domain(source).even
+        corners = source.uv[source.faces]
+        self.middle = corners.mean(axis=1)
+        self.rest = _forms(source.vertices, source.uv, source.faces)
+        self.area = topology.face_areas(source.vertices, source.faces)
+        self.forms = _forms(target.vertices, target.uv, target.faces)
+        over, self.number, _ = triangles_over_domain(target.uv[target.faces], self.even)
+        self.points = np.ascontiguousarray(np.pad(over.reshape(-1, 2), ((0, 0), (0, 1))))
+        self.faces = np.arange(len(self.points)).reshape(-1, 3)
+        self.tree = igl.AABB()
+        self.tree.init(self.points, self.faces)
+        assert target.lattice is not None
+        self.shape = target.lattice / SIDE
+
+    def alignment(self, matrix: np.ndarray, shift: np.ndarray, count: int) -> Alignment:
+        """Judged by about ``count`` of the source's triangles."""
+        chosen = np.unique(np.linspace(0, len(self.area) - 1, count).astype(int))
+        image = self.middle[chosen] @ matrix.T + shift
+        x, _ = group.into_domain(image / SIDE, self.even)
+        places = np.ascontiguousarray(np.pad(SIDE * x, ((0, 0), (0, 1))))
+        _, face, _ = self.tree.squared_distance(self.points, self.faces, places)
+        forms = self.forms[self.number[np.asarray(face).ravel()]]
+        value = _symmetric_dirichlet(self.rest[chosen], matrix.T @ forms @ matrix)
+        distortion = float(np.average(np.log(value), weights=self.area[chosen]))
+        return Alignment(matrix, shift, distortion, self.miss(matrix, shift))
+
+    def miss(self, matrix: np.ndarray, shift: np.ndarray) -> float:
+        """Root mean square distance of the landmarks."""
+        if len(self.p) == 0:
+            return 0.0
+        gap = self.gap(matrix, shift) @ self.shape.T
+        return float(np.sqrt((gap**2).sum(axis=1).mean()))
+
+    def gap(self, matrix: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """From the landmarks' images to the target's nearest lifts: (L, 2)."""
+        image = self.p @ matrix.T + shift
+        return lifted_near(self.q, image, self.even, self.target.lattice) - image
+
+    def mean_shift(self, matrix: np.ndarray) -> np.ndarray:
+        """The translation of a torus that brings the landmarks together best."""
+        angle = np.pi * (self.q - self.p @ matrix.T)
+        shift = np.angle(np.exp(1j * angle).mean(axis=0)) / np.pi
+        for _ in range(5):  # now the mean of the nearest lifts
+            shift = shift + self.gap(matrix, shift).mean(axis=0)
+        return np.mod(shift + 1, SIDE) - 1
+
+    def best_shifts(self, matrices: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Matrices with translations of a torus for which the distortion is least nearby."""
+        step = SIDE / _SHIFTS
+        grid = -1 + step * np.array(list(product(range(_SHIFTS), repeat=2)))
+        found: list[Alignment] = []
+        for matrix in matrices:
+            every = [self.alignment(matrix, c, _FEW) for c in grid]
+            score = np.array([a.score for a in every]).reshape(_SHIFTS, _SHIFTS)
+            around = [np.roll(score, d, axis=(0, 1)) for d in product((-1, 0, 1), repeat=2)]
+            found += [every[k] for k in np.flatnonzero(score <= np.min(around, axis=0))]
+        result: list[tuple[np.ndarray, np.ndarray]] = []
+        for best in sorted(found, key=lambda a: a.score)[:_FINALISTS]:
+            width = step
+            for _ in range(_HALVINGS):
+                width /= 2
+                near = [
+                    self.alignment(best.matrix, best.shift + width * np.array(d), _FEW)
+                    for d in product((-1, 0, 1), repeat=2)
+                ]
+                best = min([best, *near], key=lambda a: a.score)
+            result.append((best.matrix, np.mod(best.shift + 1, SIDE) - 1))
+        return result
+
+
+def _forms(vertices: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """First fundamental forms (F, 2, 2) of a mesh (V, 3) over its coordinates (V, 2)."""
+    side, flat = (
+        np.stack([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)], axis=2) for x in (vertices, uv)
+    )
+    jacobian = side @ np.linalg.inv(flat)
+    return np.asarray(jacobian.transpose(0, 2, 1) @ jacobian)
+
+
+def _symmetric_dirichlet(rest: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """tr M + tr (M + εI)⁻¹, at most 1,000, of maps that pull forms (N, 2, 2) back to others."""
+    (e, f, g), (h, m, n) = ((x[:, 0, 0], x[:, 0, 1], x[:, 1, 1]) for x in (rest, image))
+    with np.errstate(all="ignore"):
+        inverse = 1 / (e * g - f * f)
+        trace = (g * h - 2 * f * m + e * n) * inverse
+        determinant = (h * n - m * m) * inverse
+        value = trace + (trace + 2 * _EPSILON) / (determinant + _EPSILON * trace + _EPSILON**2)
+    return np.where(np.isfinite(value) & (value > 0), value, _WORST).clip(1.0, _WORST)
