@@ -37,7 +37,9 @@ def unwrapped(
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
     if not area > 0:
-        raise error_in(name, "not_unwrapped", "it has no area; give a mesh with texture coordinates")
+        raise error_in(
+            name, "not_unwrapped", "it has no area; give a mesh with texture coordinates"
+        )
     atlas = xatlas.Atlas()
     centred = (vertices - vertices.mean(axis=0)) / np.sqrt(area)
     atlas.add_mesh(centred.astype(np.float32), faces.astype(np.uint32))

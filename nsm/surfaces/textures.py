@@ -87,7 +87,10 @@ def read_uv(path: str | Path) -> np.ndarray | None:
     Raises:
         NsmError: ``unreadable_file``: a damaged file. The key is the path.
     """
-    uv, _, _ = _read(Path(path))
+    file = Path(path)
+    if file.suffix.lower() not in _READERS:
+        return None
+    uv, _, _ = _read(file)
     return None if np.isnan(uv).any() else uv
 
 
@@ -134,18 +137,12 @@ def _read(file: Path) -> _Read:
     """Texture coordinates (F, 3, 2), NaN where there are none; the paint (F,) of each face, and
     the paints."""
     suffix = file.suffix.lower()
-    readers: dict[str, Callable[[Path], _Read]] = {
-        ".obj": _read_obj,
-        ".ply": _read_ply,
-        ".glb": _read_gltf,
-        ".gltf": _read_gltf,
-    }
-    if suffix not in readers:
+    if suffix not in _READERS:
         reason = f"{suffix[1:].upper() or 'such'} files have no texture coordinates; use OBJ or GLB"
         raise error_in(file, "missing_uv", reason)
     check_file(file, LARGEST_FILE)
     try:
-        uv, number, paints = readers[suffix](file)
+        uv, number, paints = _READERS[suffix](file)
         return np.where(np.abs(uv) < _LARGEST_UV, uv, np.nan), number, paints
     except NsmError:
         raise
@@ -207,3 +204,11 @@ def _read_gltf(file: Path) -> _Read:
         parts.append((uv[:, :2].astype(np.float64)[faces], np.full(len(faces), k)))
         paints.append(materials.of_gltf(file, getattr(mesh.visual, "material", None)))
     return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), paints
+
+
+_READERS: dict[str, Callable[[Path], _Read]] = {
+    ".obj": _read_obj,
+    ".ply": _read_ply,
+    ".glb": _read_gltf,
+    ".gltf": _read_gltf,
+}
