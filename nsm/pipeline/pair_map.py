@@ -22,6 +22,7 @@ from nsm.pipeline.resolve_inputs import (
     vertex_count,
 )
 from nsm.pipeline.task import Given, Task, frozen
+from nsm.pipeline.textures import Textures, read_textures, write_textured
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
@@ -51,18 +52,24 @@ class PairMapTask(Task):
     table = staticmethod(pair_table)
     picture_name = "map"
     attributes: dict[str, np.ndarray]
+    textures: Textures | None = None
 
     def prepare(self, given: Given) -> None:
-        self.keep_absolute("source", "target", "landmarks", "attributes")
+        self.keep_absolute("source", "target", "landmarks", "attributes", "texture")
         settings = self.settings
-        shapes = [
-            read_shape(settings[key] if end is None else end, self.domain, key, self.config.trust)
+        ends = [
+            settings[key] if end is None else end
             for key, end in (("source", given.source), ("target", given.target))
+        ]
+        shapes = [
+            read_shape(end, self.domain, key, self.config.trust)
+            for key, end in zip(("source", "target"), ends, strict=True)
         ]
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
         ids = landmark_vertices(landmarks, shapes)
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)
+        self.textures = read_textures(settings["texture"], ends, shapes)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
 
@@ -143,6 +150,9 @@ class PairMapTask(Task):
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
+        if self.textures is not None:
+            for line in write_textured(self.textures, folder, result, self.config.texture_size):
+                self.console.print(line)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface

@@ -100,9 +100,7 @@ def _in_texels(uv: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.
 
 def _touched(xy: np.ndarray, size: int) -> np.ndarray:
     """Mask (size, size) of texels at the sides of triangles, whose corners (3 F, 2) these are."""
-    start = xy.reshape(-1, 3, 2)
-    end = np.roll(start, -1, axis=1)
-    start, end = start.reshape(-1, 2), end.reshape(-1, 2)
+    start, end = xy, np.roll(xy.reshape(-1, 3, 2), -1, axis=1).reshape(-1, 2)
     count = np.ceil(2 * np.linalg.norm(end - start, axis=1)).astype(np.int64) + 1
     side = np.repeat(np.arange(len(start)), count)
     step = np.arange(len(side)) - np.repeat(np.cumsum(count) - count, count)

@@ -191,7 +191,7 @@ class SurfaceMap:
             texture: an image for the texture coordinates of the mesh that it is carried from; by
                 default that file's own materials.
             back: from the target to the source.
-            size: texels a side of the new image, 1 to 16384.
+            size: texels a side of the new image, 1 to 8192.
 
         Returns:
             The target's mesh, or the source's with ``back``: ``.export("painted.glb")`` writes it.

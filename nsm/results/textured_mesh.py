@@ -24,7 +24,7 @@ from nsm.surfaces.textures import Texture, read_uv
 if TYPE_CHECKING:
     from nsm.results.surface_map import SurfaceMap
 
-LARGEST_SIZE = 16384  # texels a side
+LARGEST_SIZE = 8192  # texels a side
 
 
 @dataclass(frozen=True, eq=False)
