@@ -393,9 +393,9 @@ class Settings:
         landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned or .json, one for
             each surface; or pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z] stands for
             the vertex nearest to it.
-        texture: of task=pair_map: an image for the source's texture coordinates; or own: the materials
-            of its file. It is baked to the target, as target_textured.obj and .glb; the target's
-            own texture, if it has one, to the source.
+        texture: of task=pair_map: an image for the source's texture coordinates; or own: the
+            materials of its file. It is baked to the target, as target_textured.obj and .glb; the
+            target's own texture, if it has one, to the source.
         texture_size: texels a side of the baked images.
         loss_terms: your own terms: +loss_terms.mine._target_=mypackage.MyTerm
             +loss_terms.mine.weight=0.1.

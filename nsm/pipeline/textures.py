@@ -66,7 +66,7 @@ def read_textures(
     other = _own(target)
     if mine is None and other is None:
         read_texture(source)  # says what is missing
-    return Textures(*meshes, mine, other)
+    return Textures(meshes[0], meshes[1], mine, other)
 
 
 def _own(path: str | Path) -> Texture | None:
