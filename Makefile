@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-closed bench-activation bench-speed bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-closed bench-correspondence bench-activation bench-speed bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -32,10 +32,16 @@ bench-steps: .venv/.nsm-dev
 # Maps between the meshes in MESHES, and flattening compared with libigl: over an hour.
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
+	$(BIN)/python benchmarks/closed_maps.py $(if $(MESHES),--meshes $(MESHES))
 
 # Closed surfaces on the disc and on the orbifold, default settings: ten minutes. MESHES as above.
 bench-closed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/closed_surfaces.py $(if $(MESHES),--meshes $(MESHES))
+
+# Correspondences without landmarks, errors at annotated ones: an hour, or EVERY=5. MESHES as above.
+bench-correspondence: .venv/.nsm-dev
+	$(BIN)/python benchmarks/correspondence.py $(if $(MESHES),--meshes $(MESHES)) \
+	  $(if $(EVERY),--every $(EVERY))
 
 # One network with each activation, its wrinkles, and a report on the runs: half an hour.
 bench-activation: .venv/.nsm-dev
@@ -48,7 +54,7 @@ torture: .venv/.nsm-dev
 # Fuzz each reader of files for FUZZ_SECONDS; test each property on FUZZ_EXAMPLES times the examples
 # of the tests.
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks surface map pair collection checkpoint
+FUZZ_TARGETS ?= obj off ply stl gltf glb config pairs landmarks picked barycentric surface map pair collection checkpoint
 FUZZ_EXAMPLES ?= 20
 fuzz: .venv/.nsm-dev
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[fuzz]'

@@ -30,7 +30,7 @@ from nsm.domains.common_seams import (
 from nsm.results import by_file_vertex
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths
-from nsm.surfaces.landmarks import read_landmarks
+from nsm.surfaces.landmark_files import read_landmarks
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import CleanMesh, clean
 

@@ -240,6 +240,19 @@ class AttributesSettings:
 
 
 @dataclass
+class ProposalSettings:
+    """What happens to landmarks that landmarks=auto proposes.
+
+    Args:
+        strict: end with an error where the proposal is not sure, before any training.
+        alternative: which proposal is taken: 0 the best, 1 the second best.
+    """
+
+    strict: bool = False
+    alternative: Whole = 0
+
+
+@dataclass
 class SeamSettings:
     """How closed meshes with landmarks are cut jointly.
 
@@ -390,9 +403,13 @@ class Settings:
         target: the same; or an analytic surface: a name (sphere_cap, plane, ...; sphere with
             domain=orbifold, torus with domain=torus) or '{name: graph, z: 0.3*u*v}'.
         surfaces: of task=collection_map: three surfaces or more, each as source.
-        landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned or .json, one for
-            each surface; or pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z] stands for
-            the vertex nearest to it.
+        landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned, .bary, .pp or
+            .json, one for each surface, or the names of meshes of the catalogue that have some; or
+            pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
+            b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
+            task=pair_map with two closed meshes of genus 0: landmarks are proposed.
+        isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
+            begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the
             materials of its file. It is baked to the target, as target_textured.obj and .glb; the
             target's own texture, if it has one, to the source.
@@ -416,6 +433,8 @@ class Settings:
     texture: str | None = None
     texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)
+    proposal: ProposalSettings = field(default_factory=ProposalSettings)
+    isotopy_class: Whole = 0
     seam: SeamSettings = field(default_factory=SeamSettings)
     certification: CertificationSettings = field(default_factory=CertificationSettings)
     trainer: TrainerSettings = field(default_factory=TrainerSettings)

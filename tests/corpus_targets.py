@@ -19,7 +19,7 @@ import nsm
 from nsm.config import read_config
 from nsm.errors import NsmError
 from nsm.pipeline.checkpoints import stored_state
-from nsm.surfaces.landmarks import read_landmarks, read_pairs
+from nsm.surfaces.landmark_files import read_landmarks, read_pairs
 from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.validation import clean
 
@@ -103,6 +103,8 @@ TARGETS: dict[str, Callable[[bytes], bool]] = {
     "config": partial(_in_file, "config.yaml", read_config),
     "pairs": partial(_in_file, "pairs.json", read_pairs),
     "landmarks": partial(_in_file, "landmarks.vts", read_landmarks),
+    "picked": partial(_in_file, "landmarks.pp", read_landmarks),
+    "barycentric": partial(_in_file, "landmarks.bary", read_landmarks),
     "checkpoint": partial(_in_file, "last.ckpt", stored_state),
     **{stem: partial(_artefact, stem) for stem in ARTEFACTS},
 }

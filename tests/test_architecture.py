@@ -9,7 +9,17 @@ import nsm
 
 PACKAGE = Path(nsm.__file__).parent
 # from left to right; a module imports from its own room and from those before it
-ROOMS = ["surfaces", "maps", "energies", "domains", "data", "tasks", "results", "pipeline"]
+ROOMS = [
+    "surfaces",
+    "maps",
+    "energies",
+    "domains",
+    "correspondence",
+    "data",
+    "tasks",
+    "results",
+    "pipeline",
+]
 # what every room may import
 COMMON = {"errors", "instantiation", "optional_dependencies", "settings"}
 # rooms that stand for themselves: meshes in numpy, and maps in torch

@@ -21,7 +21,7 @@ from nsm.config import read_config
 from nsm.errors import NsmError
 from nsm.instantiation import check_trusted, is_trusted
 from nsm.results.files import check_stored
-from nsm.surfaces.landmarks import read_landmarks
+from nsm.surfaces.landmark_files import read_landmarks
 from nsm.surfaces.loading import load_mesh
 
 TINY = [

@@ -3,6 +3,7 @@
 Disc and square have a boundary; orbifold and torus are closed.
 """
 
+from nsm.domains.automatic import Automatic
 from nsm.domains.base import BoundedDomain, Domain, Keys
 from nsm.domains.disc import Disc
 from nsm.domains.names import DOMAINS, bounded, domain, from_stored, stored
@@ -12,6 +13,7 @@ from nsm.domains.surface import Surface
 
 __all__ = [
     "DOMAINS",
+    "Automatic",
     "BoundedDomain",
     "Disc",
     "Domain",

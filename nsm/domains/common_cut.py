@@ -120,15 +120,19 @@ def _disagreement(way: CommonCut, landmarks: Sequence[np.ndarray]) -> float:
     far it misses the landmarks off the seam.
 
     The worst ordered pair counts. Landmarks on the wrong side of a seam lie far apart in Ω, and no
-    map without folds brings them together; hence the factor.
+    map without folds brings them together; hence the factor. Infinite where a disc cannot be laid
+    out without flips.
     """
     fractions = np.mean(
         [_arc_lengths(cut, key) for cut, key in zip(way.cuts, way.keys, strict=True)], axis=0
     )
-    flat = [
-        _DISC.embed(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
-        for cut, key in zip(_of_disc_area(way.cuts), way.keys, strict=True)
-    ]
+    try:
+        flat = [
+            _DISC.embed(cut.vertices, cut.faces, method="slim_held", keys=Keys(key, fractions)).uv
+            for cut, key in zip(_of_disc_area(way.cuts), way.keys, strict=True)
+        ]
+    except NsmError:
+        return np.inf
     places = []
     for cut, uv, ids in zip(way.cuts, flat, landmarks, strict=True):
         off = [int(np.flatnonzero(cut.origin == v)[0]) for v in ids]

@@ -142,10 +142,7 @@ def _common_topology(meshes: Sequence[Mesh], cleaned: Sequence[CleanMesh]) -> tu
     Raises:
         NsmError: ``wrong_topology``: they differ; a map would be torn.
     """
-    found = []
-    for clean_mesh in cleaned:
-        loops = len(topology.boundary_loops(clean_mesh.faces))
-        found.append(((2 - topology.euler_characteristic(clean_mesh.faces) - loops) // 2, loops))
+    found = [topology.genus_and_boundary(c.faces) for c in cleaned]
     for mesh, (genus, loops) in zip(meshes, found, strict=True):
         if (genus, loops) != found[0]:
             raise NsmError(

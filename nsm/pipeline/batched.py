@@ -21,6 +21,7 @@ from nsm.domains import Surface, domain
 from nsm.errors import NsmError
 from nsm.instantiation import made, target_of
 from nsm.maps.networks import SKIPS
+from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.configured_surface import configured_surface, keep_absolute, report_surface
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.overfit import OverfitTask
@@ -57,7 +58,7 @@ def common_settings(settings: Mapping[str, Any]) -> dict[str, Any] | None:
         or settings["data"]["_target_"] not in (target_of(SurfaceData), "nsm.data.SurfaceData")
         or settings["map"]["block"] not in SKIPS
         # each surface has a grid of its own lattice
-        or not domain(settings["domain"]).has_boundary
+        or not (is_automatic(settings["domain"]) or domain(settings["domain"]).has_boundary)
         or settings["loss_terms"]
         or settings["callbacks"]
         or optimizer is None
@@ -209,7 +210,9 @@ def run_batched(calls: Sequence[Call]) -> Iterator[Ended]:
                 lock.close()
                 yield number, reason
                 continue
-            stages.setdefault(ready.run.stage, []).append(_Job(number, call, lock, ready))
+            # networks on closed domains differ by their lattices
+            stage = ready.run.stage if ready.task.domain.has_boundary else None
+            stages.setdefault(stage, []).append(_Job(number, call, lock, ready))
         for stage, jobs in stages.items():
             if stage is None:
                 yield from (job.alone() for job in jobs)
@@ -226,6 +229,10 @@ def _ready(
         return None
     run = job_run(settings, place)
     keep_absolute(run.config)
+    if is_automatic(run.config.domain):
+        given = run.config.surface
+        named = given.name if given.path is None else given.path
+        choose_domain(run.config, [named], console, closed=True)
     key = f"{run.config.surface} {run.config.domain}"
     if key not in surfaces:
         surfaces[key] = configured_surface(run.config)

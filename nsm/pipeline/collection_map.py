@@ -22,7 +22,6 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     SurfaceCollection,
-    by_file_vertex,
     collection_metrics,
     collection_table,
     export_surface,
@@ -53,6 +52,10 @@ class CollectionMapTask(Task):
     table = staticmethod(collection_table)
     picture_name = "map"
 
+    def inputs(self, given: Given) -> list[Any]:
+        surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
+        return list(surfaces) if isinstance(surfaces, (list, tuple)) else []
+
     def prepare(self, given: Given) -> None:
         self.keep_absolute("surfaces", "landmarks")
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -67,7 +70,7 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes)
+        ids = landmark_vertices(landmarks, shapes, self.console)
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
@@ -189,8 +192,8 @@ class CollectionMapTask(Task):
         self, folder: Path, f: Any, source: NeuralSurface, target: NeuralSurface
     ) -> None:
         folder.mkdir(exist_ok=True)
-        image = target.in_original_units(f.image)
-        np.save(folder / "mapped_vertices.npy", by_file_vertex(source.surface, image))
+        image = target.in_original_units(f.welded_image)
+        np.save(folder / "mapped_vertices.npy", image)
         vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
         export_surface(file, vertices, target.surface, f.source_uv)

@@ -39,6 +39,11 @@ class OverfitTask(Task):
     closed_domains = True
     start: Overfit | None = None
 
+    def inputs(self, given: Given) -> list[Any]:
+        settings = self.config.surface
+        named = settings.name if settings.path is None else settings.path
+        return [named if given.surface is None else given.surface]
+
     def prepare(self, given: Given) -> None:
         surface = given.surface
         self.use(configured_surface(self.config) if surface is None else surface)

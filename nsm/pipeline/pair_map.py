@@ -12,9 +12,11 @@ from rich.text import Text
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
-from nsm.domains.orbifold.alignment import alignments
+from nsm.domains.orbifold.alignment import Alignment, alignments
+from nsm.errors import NsmError
 from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.proposed_landmarks import AUTO, ProposedLandmarks, propose_landmarks
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
     neural_surfaces,
@@ -26,10 +28,12 @@ from nsm.pipeline.textures import Textures, read_textures, write_textured
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
-    by_file_vertex,
     distortion_picture,
+    export_mesh,
     export_surface,
+    isotopy_table,
     map_image,
+    mean_log_distortion,
     morph_pictures,
     pair_metrics,
     pair_table,
@@ -41,6 +45,9 @@ from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
 
 _MORPH_FRAMES = 9
+_CLASSES_SHOWN, _CLASSES_TRIED = 4, 3
+# percent of the diagonal: landmarks that stay so far off are on the wrong side of a twist
+_MISSED = 1.0
 
 
 class PairMapTask(Task):
@@ -53,23 +60,29 @@ class PairMapTask(Task):
     picture_name = "map"
     attributes: dict[str, np.ndarray]
     textures: Textures | None = None
+    proposed: ProposedLandmarks | None = None
+
+    def inputs(self, given: Given) -> list[Any]:
+        ends = (("source", given.source), ("target", given.target))
+        return [self.settings[key] if end is None else end for key, end in ends]
 
     def prepare(self, given: Given) -> None:
         self.keep_absolute("source", "target", "landmarks", "attributes", "texture")
         settings = self.settings
-        ends = [
-            settings[key] if end is None else end
-            for key, end in (("source", given.source), ("target", given.target))
-        ]
+        ends = self.inputs(given)
         shapes = [
             read_shape(end, self.domain, key, self.config.trust)
             for key, end in zip(("source", "target"), ends, strict=True)
         ]
+        self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes)
+        self.proposed = None
+        if isinstance(landmarks, str) and landmarks == AUTO:
+            self.proposed = propose_landmarks(shapes, **settings["proposal"], console=self.console)
+            landmarks = self.proposed.landmarks
+        ids = landmark_vertices(landmarks, shapes, self.console)
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)
-        self.textures = read_textures(settings["texture"], ends, shapes)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
 
@@ -80,8 +93,7 @@ class PairMapTask(Task):
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
             self.alignments = alignments(phi.surface, psi.surface, common)
-            for one in self.alignments[:3]:
-                self.console.print(str(one.matrix.tolist()), one.shift, one.score)
+            self.console.print(isotopy_table(self.alignments[:_CLASSES_SHOWN]))
 
     @property
     def title(self) -> str:
@@ -117,13 +129,53 @@ class PairMapTask(Task):
         """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)
         or by distortion."""
         if not self.domain.has_boundary:
-            return aligned(self.alignments[0])
+            return aligned(self._alignment)
         if len(p):
             rotation = landmark_rotation(self.domain, p, q)
         else:
             some = torch.as_tensor(self.surface.uv[:: len(self.surface.uv) // 4096 + 1]).float()
             rotation = least_distorting_rotation(self.domain, self.phi.map, self.psi.map, some)
         return Rotated(torch.nn.Identity(), rotation)
+
+    @property
+    def _alignment(self) -> Alignment:
+        """The start in the isotopy class of the settings.
+
+        Raises:
+            NsmError: ``out_of_range``: there are fewer likely classes.
+        """
+        number = self.config.get("isotopy_class", 0)  # absent in older run folders
+        if number >= len(self.alignments):
+            raise NsmError(
+                f"isotopy_class={number}: there are {len(self.alignments)} likely classes; give a "
+                f"number from 0 to {len(self.alignments) - 1}",
+                kind="out_of_range",
+                key="isotopy_class",
+            )
+        return self.alignments[number]
+
+    def begin_again(self, module: Any) -> bool:
+        """Whether the isotopy class is wrong: landmarks are still missed, or the map is worse than
+        a start in the next class before any training. The next class is then tried."""
+        if self.domain.has_boundary:
+            return False
+        number = self.config.isotopy_class
+        if number + 1 >= min(_CLASSES_TRIED, len(self.alignments)):
+            return False
+        result = self.make_result(module)
+        after = mean_log_distortion(self.surface, result.image)
+        missed = float(module.landmark_error().detach().max()) if len(module.points) else 0.0
+        following = self.alignments[number + 1]
+        wrong = missed > _MISSED or following.distortion < after
+        self.console.print(
+            f"isotopy class {number}: mean log distortion {after:.3f}, landmarks missed by "
+            f"{missed:.3g} % of the diagonal at worst; class {number + 1} before its training: "
+            f"{following.distortion:.3f}" + (f"; class {number + 1} is tried" if wrong else ""),
+            soft_wrap=True,
+        )
+        if wrong:
+            self.config.isotopy_class = number + 1
+        return wrong
 
     def make_result(self, module: Any) -> SurfaceMap:
         ids = np.stack(self.ids, axis=1)
@@ -135,6 +187,8 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        if len(source.seam_pairs) and source.domain.has_boundary:
+            result.metrics.update(result.weld.figures(target.bounding_box_diagonal))
 
     def warnings(self, result: SurfaceMap) -> list[Text]:
         name = f"{self.surface.name} → {self.psi.surface.name}"
@@ -142,13 +196,22 @@ class PairMapTask(Task):
         return [] if torn is None else [torn]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
-        return {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}
+        said = {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}
+        if self.domain.has_boundary:
+            return said
+        classes = [
+            {"matrix": a.matrix.astype(int).tolist(), "shift": a.shift.tolist(), "score": a.score}
+            for a in self.alignments[:_CLASSES_SHOWN]
+        ]
+        return {**said, "isotopy_class": self.config.isotopy_class, "isotopy_classes": classes}
 
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
 
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
         if self.textures is not None:
             for line in write_textured(self.textures, folder, result, self.config.texture_size):
@@ -156,10 +219,8 @@ class PairMapTask(Task):
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
-        image = f.target.in_original_units(f.image)
-        np.save(folder / "mapped_vertices.npy", by_file_vertex(s, image))
+        _write_image(folder, f)
         meshes = {
-            "mapped": (image, s, s.uv),
             "target_with_source_uv": (f.target.in_original_units(t.vertices), t, f.source_uv),
             "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
@@ -173,3 +234,16 @@ class PairMapTask(Task):
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_image(folder: Path, f: SurfaceMap) -> None:
+    """The source's mesh on the target, welded: a closed one is closed."""
+    s, weld = f.source.surface, f.weld
+    image = f.target.in_original_units(f.welded_image)
+    np.save(folder / "mapped_vertices.npy", image)
+    points = f.target.in_original_units(weld.points)
+    export_surface(folder / "mapped.glb", points, s, s.uv)
+    if s.domain.has_boundary:
+        export_mesh(folder / "mapped.obj", image, weld.faces, s.uv, corners=weld.corners)
+    else:
+        export_surface(folder / "mapped.obj", points, s, s.uv)

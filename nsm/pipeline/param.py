@@ -34,6 +34,10 @@ class ParamTask(Task):
     table = staticmethod(comparison_table)
     picture_name = "layout"
 
+    def inputs(self, given: Given) -> list[Any]:
+        ready = self.config.phi.path if given.phi is None else given.phi
+        return [] if ready is None else [ready]
+
     def prepare(self, given: Given) -> None:
         self.use(neural_surface(self.config, self.console) if given.phi is None else given.phi)
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.pipeline.certification import certified
+from nsm.pipeline.checkpoints import CHECKPOINT_FILE
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.process_state import process_state
 from nsm.pipeline.task import Given, Task
@@ -71,6 +72,7 @@ def run_task(
     with process_state():
         task = make_task(config, Console(highlight=False, markup=False))
         check_packages(config.logger)
+        task.choose_domain(given or Given())
         task.prepare(given or Given())
         return run_prepared(task, Run(config, folder, resuming), started)
 
@@ -102,6 +104,11 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
     """
     module, data = built(task), task.build_data()
     trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
+    while task.begin_again(module):
+        # first this, then the new settings: a run that is killed between does the same again
+        (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+        module, data = built(task), task.build_data()
+        trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
     return finish(task, run, module, trainer, started, data=data)
 
 
@@ -155,6 +162,10 @@ def finish(
         result = task.make_result(module)
     task.measure(result)
     task.save(run.folder, result)
+    if task.table is not None:
+        task.console.print(task.table(result.metrics))
+    for warning in task.warnings(result):
+        task.console.print(warning, soft_wrap=True)
     if task.config.artefacts:
         task.write_artefacts(run.folder, result)
     ensemble = trainer.lightning_module
@@ -173,10 +184,6 @@ def finish(
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
-    if task.table is not None:
-        task.console.print(task.table(result.metrics))
-    for warning in task.warnings(result):
-        task.console.print(warning, soft_wrap=True)
     if not is_temporary(run.folder):
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result

@@ -106,7 +106,8 @@ def cached_surfaces(
                 _made(surface, overfit, Path(folder) / str(k), console)
                 for k, surface in enumerate(surfaces)
             ]
-    if accelerator_of(overfit) == "gpu" and common_settings(settings) is not None:
+    together = common_settings(settings) is not None  # not on closed domains, for instance
+    if accelerator_of(overfit) == "gpu" and together:
         folders = {_folder_of(surface, settings): surface for surface in surfaces}
         missing = {f: surface for f, surface in folders.items() if not is_complete(f)}
         if len(missing) > 1:

@@ -19,6 +19,7 @@ from rich.text import Text
 from nsm.domains import Surface, domain
 from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
+from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
 from nsm.tasks.training import Training
 
@@ -98,6 +99,8 @@ class Task:
             NsmError: ``wrong_domain``: the task needs a domain with boundary.
         """
         self.config, self.console = config, console
+        if is_automatic(config.domain):
+            return  # until the inputs are known
         self.domain = domain(config.domain)
         if not (self.domain.has_boundary or self.closed_domains):
             raise NsmError(
@@ -116,6 +119,22 @@ class Task:
         """Make the paths in settings absolute: a run can then be resumed from any folder."""
         for key in keys:
             self.config[key] = _absolute(self.settings[key])
+
+    def inputs(self, given: Given) -> list[Any]:
+        """The surfaces that the run is given, as settings or callers name them, which say what
+        ``domain=auto`` is; with none, it is the disc."""
+        return []
+
+    def choose_domain(self, given: Given) -> None:
+        """Put the domain that suits the inputs in place of ``domain=auto``.
+
+        Raises:
+            NsmError: an input that cannot be used.
+        """
+        if is_automatic(self.config.domain):
+            closed = self.closed_domains
+            choose_domain(self.config, self.inputs(given), self.console, closed=closed)
+            self.setup(self.config, self.console)
 
     def prepare(self, given: Given) -> None:
         """Find and prepare the inputs, and set ``surface``; the configuration's paths become
@@ -168,6 +187,13 @@ class Task:
             self.data_settings, **inputs, sampler=sampler, seed=self.config.seed
         )
         return data
+
+    def begin_again(self, module: Any) -> bool:
+        """Whether a trained module shows that another start is needed; the settings then have it.
+
+        The task says so. A run that is resumed begins with the start in its settings.
+        """
+        return False
 
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""

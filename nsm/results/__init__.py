@@ -8,7 +8,7 @@ from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh, export_surface
 from nsm.results.metrics import overfit_metrics, pointwise_metrics, vertex_error
-from nsm.results.pair_metrics import pair_metrics
+from nsm.results.pair_metrics import mean_log_distortion, pair_metrics
 from nsm.results.pair_pictures import (
     distortion_picture,
     map_image,
@@ -27,6 +27,7 @@ from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map
 from nsm.results.tables import (
     collection_table,
     comparison_table,
+    isotopy_table,
     metrics_table,
     pair_table,
     warning_of_tears,
@@ -63,6 +64,8 @@ __all__ = [
     "layout_image",
     "load_parameterization",
     "load_surface",
+    "isotopy_table",
+    "mean_log_distortion",
     "metrics_table",
     "on_cut_mesh",
     "overfit_metrics",

@@ -23,13 +23,15 @@ def export_mesh(
     *,
     texture: Image.Image | None = None,
     colours: np.ndarray | None = None,
+    corners: np.ndarray | None = None,
 ) -> None:
     """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
 
     A closed surface without a seam has no coordinates that are continuous on it: it goes without
     (None), and a GLB file may have colours (V, 3) in [0, 1] at the vertices instead of a texture.
     Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file contains the
-    texture; beside an OBJ file go a material file and a PNG.
+    texture; beside an OBJ file go a material file and a PNG. In an OBJ file the triangles' corners
+    may have rows of uv of their own, corners (F, 3), instead of those of their vertices.
 
     Raises:
         NsmError: ``unknown_format``: the file's ending is neither .obj nor .glb.
@@ -58,7 +60,8 @@ def export_mesh(
         lines += [f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist()]
     else:
         lines += [f"vt {u:.9g} {v:.9g}\n" for u, v in coordinates.tolist()]
-        lines += [f"f {a}/{a} {b}/{b} {c}/{c}\n" for a, b, c in (faces + 1).tolist()]
+        both = np.stack([faces, faces if corners is None else corners], axis=2) + 1
+        lines += ["f {}/{} {}/{} {}/{}\n".format(*f) for f in both.reshape(-1, 6).tolist()]
     atomic_write(target, "".join(lines).encode())
 
 

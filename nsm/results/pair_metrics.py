@@ -33,6 +33,7 @@ ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
 # precision of a boundary point in float32
 ON_BOUNDARY = 1e-6
 _COVER_SAMPLES = 20_000
+_WORST = 1e3
 
 
 def triangle_energies(
@@ -54,6 +55,19 @@ def distortion_figures(
         faces: (F, 3).
     """
     return summaries(triangle_energies(source, image, faces), face_areas(source, faces))
+
+
+def mean_log_distortion(source: Surface, image: np.ndarray) -> float:
+    """Mean logarithm of symmetric Dirichlet over a surface's triangles, weighted by area, as
+    :class:`nsm.domains.orbifold.alignment.Alignment` has it; each counts 1,000 at most.
+
+    Args:
+        source: the surface.
+        image: (V, 3) of its vertices.
+    """
+    a, b = (triangle_metric(x, source.faces) for x in (source.vertices, image))
+    value = np.nan_to_num(symmetric_dirichlet(a, b).numpy(), nan=_WORST).clip(1.0, _WORST)
+    return float(np.average(np.log(value), weights=face_areas(source.vertices, source.faces)))
 
 
 def pair_metrics(

@@ -22,6 +22,7 @@ from nsm.results.metrics import evaluate
 from nsm.results.networks import placed_map
 from nsm.results.points import as_points, as_values
 from nsm.results.textured_mesh import LARGEST_SIZE, TexturedMesh, painted, read_file_mesh
+from nsm.results.welding import Weld, weld
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.textures import read_texture
 
@@ -132,6 +133,20 @@ class SurfaceMap:
         if back:
             return s.domain.locate(given.take(t.uv, t.faces), self.image_uv, s.faces)
         return t.domain.locate(given.take(self.image_uv, s.faces), t.uv, t.faces)
+
+    @cached_property
+    def weld(self) -> Weld:
+        """The image with one point for all copies of a seam vertex (see :func:`weld`); copies of a
+        landmark go where its first one goes."""
+        s, t = self.source.surface, self.target.surface
+        kept = np.unique(s.cut_vertex[self.landmarks[:, 0]])
+        return weld(s, t, self._forth, kept)
+
+    @cached_property
+    def welded_image(self) -> np.ndarray:
+        """Images (W, 3) of the mesh file's vertices on the target, welded, in normalised units;
+        with the faces of ``weld`` the image of a closed mesh is closed."""
+        return by_file_vertex(self.source.surface, self.weld.points)
 
     @cached_property
     def _forth(self) -> Places:

@@ -8,6 +8,8 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from nsm.domains.orbifold.alignment import Alignment
+
 _ROWS = {
     "rms_percent": ("RMS distance", "% of diagonal"),
     "max_percent": ("largest distance", "% of diagonal"),
@@ -63,6 +65,8 @@ _PAIR_ROWS = {
     "covered_percent": ("target covered", "% of area"),
     "seam_gap_mean_percent": ("gap across the seam, mean", "% of diagonal"),
     "seam_gap_max_percent": ("gap across the seam, largest", "% of diagonal"),
+    "welded_flipped_triangles": ("triangles turned over by the weld", ""),
+    "welded_move_max_percent": ("way of the weld, largest", "% of diagonal"),
 }
 
 
@@ -87,6 +91,16 @@ def warning_of_tears(name: str, metrics: Mapping[str, float]) -> Text | None:
         "closed surfaces of genus 0 or 1, domain=orbifold or domain=torus, which have no seam",
         style="bold red",
     )
+
+
+def isotopy_table(found: Sequence[Alignment]) -> Table:
+    """Starts x ↦ Bx + c of likely isotopy classes and what they are compared by, best first."""
+    table = Table("isotopy class", "B", "c", "mean log distortion", "landmarks missed", "score")
+    for number, one in enumerate(found):
+        c = [round(float(x), 3) for x in one.shift]
+        figures = (f"{x:.3f}" for x in (one.distortion, one.miss, one.score))
+        table.add_row(str(number), str(one.matrix.astype(int).tolist()), str(c), *figures)
+    return table
 
 
 _COLLECTION_COLUMNS = {

@@ -7,12 +7,14 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from nsm.errors import NsmError
 from nsm.surfaces import bundled, shapes
 from nsm.surfaces.cache import cache_folder
+from nsm.surfaces.landmark_files import Marks, read_marks
 from nsm.surfaces.loading import error_in, load_mesh
 
 TIMEOUT_SECONDS = 30
@@ -31,7 +33,7 @@ class _Remote:
     file: str
     url: str
     sha256: str
-    description: str
+    description: str = ""
 
 
 _REMOTE = {
@@ -65,6 +67,18 @@ _REMOTE = {
         "d8684326f9bd8cfc24d3d302c1042fa16f63d2e66e49ed56b413fa20bed271e6",
         "Blender's monkey head, 507 vertices, open at the eyes (fetched)",
     ),
+    "cat": _Remote(
+        "cat_horse-0.obj",
+        f"{_ANIMALS}/yang2020/cat_horse/input0.obj",
+        "40f92e9043c55b63577cbeee14821ec042446b01c330eeea7bde591bc201ba59",
+        "Cat, 8377 vertices, closed, 17 landmarks in common with the horse (fetched)",
+    ),
+    "horse": _Remote(
+        "cat_horse-1.obj",
+        f"{_ANIMALS}/yang2020/cat_horse/input1.obj",
+        "1eb915c3b9c997f4a6f11cc1e8435f72f878d317f765ba4e0b03dc019957f988",
+        "Horse, 9493 vertices, closed, 17 landmarks in common with the cat (fetched)",
+    ),
     "shrec07-381": _Remote(
         "shrec07-381.off",
         f"{_ANIMALS}/shrec/381.off",
@@ -88,6 +102,39 @@ _REMOTE = {
         f"{_ANIMALS}/shrec/393.off",
         "d29b9248ee7be464d20ebee0101369ddcea6006332fd5cb2f5ee3af5ee49f80c",
         "SHREC 2007 four-legged animal 393, 9757 vertices, closed (fetched)",
+    ),
+}
+
+_LANDMARKS = {
+    "cat": _Remote(
+        "cat_horse-0.txt",
+        f"{_ANIMALS}/yang2020/cat_horse/landmarks0.txt",
+        "4144296821981c30f46a59d4500dd7f07c6dabd0524a693b2b2bf42361984378",
+    ),
+    "horse": _Remote(
+        "cat_horse-1.txt",
+        f"{_ANIMALS}/yang2020/cat_horse/landmarks1.txt",
+        "ce5d35e9282ac904a39038da0f67417892b1300a961e9090d77e4e306cb30697",
+    ),
+    "shrec07-381": _Remote(
+        "shrec07-381.vts",
+        f"{_ANIMALS}/shrec/381.vts",
+        "d7619da7cac288f51010d991a6af802ad678965a6806ecf90134bc3cd739c408",
+    ),
+    "shrec07-384": _Remote(
+        "shrec07-384.vts",
+        f"{_ANIMALS}/shrec/384.vts",
+        "7802ce114854537161e19387a3cab04aed1020bb685f81858837c89910a71016",
+    ),
+    "shrec07-388": _Remote(
+        "shrec07-388.vts",
+        f"{_ANIMALS}/shrec/388.vts",
+        "d914c8be386ea4d6ffee074b16a6e71678a4e6992684ce59e400583c6c746956",
+    ),
+    "shrec07-393": _Remote(
+        "shrec07-393.vts",
+        f"{_ANIMALS}/shrec/393.vts",
+        "c289ae42b83898ef3ec9baf55eb78a745eec9d031ee47fa5d70dc04ebfb658ba",
     ),
 }
 
@@ -125,7 +172,8 @@ def catalogue_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
     if name in _LOCAL:
         return _LOCAL[name][0]()
     if name in _REMOTE:
-        return _fetch(name, _REMOTE[name])
+        vertices, faces, _ = load_mesh(_fetch(name, _REMOTE[name]))
+        return vertices, faces
     near = difflib.get_close_matches(name, catalogue_names(), n=1, cutoff=0.0)
     raise NsmError(
         f"'{name}' is not in the catalogue; did you mean '{near[0]}'? "
@@ -135,7 +183,22 @@ def catalogue_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _fetch(name: str, remote: _Remote) -> tuple[np.ndarray, np.ndarray]:
+def has_landmarks(name: str) -> bool:
+    """Whether a mesh of the catalogue comes with landmarks."""
+    return name in _LANDMARKS
+
+
+def catalogue_landmarks(name: str) -> Marks:
+    """The landmarks of a mesh of the catalogue, fetched as the mesh is.
+
+    Raises:
+        NsmError: as :func:`catalogue_mesh`.
+    """
+    return read_marks(_fetch(name, _LANDMARKS[name]))
+
+
+def _fetch(name: str, remote: _Remote) -> Path:
+    """A file of the catalogue, downloaded and checked if it is not in the cache."""
     import pooch
 
     mirror = os.environ.get("NSM_MESH_URL")
@@ -161,5 +224,4 @@ def _fetch(name: str, remote: _Remote) -> tuple[np.ndarray, np.ndarray]:
             else ("download_failed", "is not a usable address")
         )
         raise error_in(name, kind, f"{url} {reason}; {_INSTEAD}") from error
-    vertices, faces, _ = load_mesh(file)
-    return vertices, faces
+    return Path(file)

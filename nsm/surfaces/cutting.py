@@ -328,6 +328,37 @@ def _split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     return points, np.concatenate([faces[~touched], np.array(new, dtype=np.int64)]), inserted
 
 
+# The pieces that _split_chords makes of a face, by the inserted ones among the first one's corners,
+# and where in the pieces (row, corner) the face's own corners are.
+_PIECES = {
+    (False, True, False): (2, ((0, 0), (1, 1), (0, 2))),
+    (True, False, True): (3, ((1, 0), (0, 1), (2, 2))),
+    (False, True, True): (4, ((0, 0), (1, 1), (2, 2))),
+}
+
+
+def chords_joined(faces: np.ndarray, inserted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The faces of a disc before its chords were split.
+
+    Args:
+        faces: (G, 3) of a :class:`Cut`.
+        inserted: (W,) mask of the vertices that it inserted.
+
+    Returns:
+        Faces (F, 3), and a mask (F,) of those that were in pieces.
+    """
+    is_piece = inserted[faces].any(axis=1)
+    pieces, joined, at = faces[is_piece], [], 0
+    while at < len(pieces):
+        first, second, third = inserted[pieces[at]].tolist()
+        count, own = _PIECES[first, second, third]
+        joined.append([int(pieces[at + row, corner]) for row, corner in own])
+        at += count
+    whole = faces[~is_piece]
+    in_pieces = np.arange(len(whole) + len(joined)) >= len(whole)
+    return np.concatenate([whole, np.array(joined, dtype=np.int64).reshape(-1, 3)]), in_pieces
+
+
 def seam_pairs(origin: np.ndarray) -> np.ndarray:
     """The first copy and each further copy (T, 2) of vertices with the same origin."""
     known = np.flatnonzero(origin >= 0)

@@ -123,6 +123,12 @@ def euler_characteristic(faces: np.ndarray) -> int:
     return len(np.unique(faces)) - len(edges_of(faces).pairs) + len(faces)
 
 
+def genus_and_boundary(faces: np.ndarray) -> tuple[int, int]:
+    """Genus and number of boundary loops of an oriented surface of one component."""
+    loops = len(boundary_loops(faces))
+    return (2 - euler_characteristic(faces) - loops) // 2, loops
+
+
 def is_disc(faces: np.ndarray) -> bool:
     """Whether a mesh has one component, one boundary loop and Euler characteristic 1."""
     return (

@@ -183,7 +183,7 @@ def test_fractions_run_counter_clockwise_from_corner_to_corner():
 
 
 def test_the_animals_are_cut_alike(shared_meshes):
-    from nsm.surfaces.landmarks import read_landmarks
+    from nsm.surfaces.landmark_files import read_landmarks
     from nsm.surfaces.loading import load_mesh
 
     names = ["shrec07-384", "shrec07-388"]

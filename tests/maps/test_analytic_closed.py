@@ -11,6 +11,7 @@ from scipy.special import ellipeinc, ellipj, ellipk, ellipkinc
 from thorough import examples
 
 from nsm.domains.names import domain as domain_of
+from nsm.energies import symmetric_dirichlet
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC, build_analytic
 
@@ -186,6 +187,19 @@ def test_sphere_along_a_side_is_a_quotient_of_elliptic_functions():
     x, y, _ = natural({"name": "sphere"})(torch.stack([u, torch.zeros_like(u)], dim=1)).T
     sn, _, dn, _ = ellipj(ellipk(0.5) * u.numpy(), 0.5)
     np.testing.assert_allclose((y / (1 + x)).numpy(), 0.5 * (sn / dn) ** 2, atol=1e-12)
+
+
+def test_distortion_of_the_sphere_is_as_documented():
+    surface = build_analytic({"name": "sphere"})
+    x, weights = gauss_points(surface, 300)
+    jacobian = surface.value_and_jacobian(x)[1]
+    stretch = jacobian / math.sqrt(math.pi / 2)  # of the plane in which the domain has area π
+    metric = stretch.mT @ stretch
+    energy = symmetric_dirichlet(torch.eye(2, dtype=x.dtype).expand_as(metric), metric)
+    order = energy.argsort()
+    share = (weights * normals(jacobian).norm(dim=1))[order].cumsum(0) / math.pi
+    for fraction, wanted in ((0.5, 4.24), (0.95, 5.26)):
+        assert float(energy[order][share >= fraction][0]) == pytest.approx(wanted, abs=5e-3)
 
 
 def test_ellipsoid_of_equal_axes_is_the_sphere():

@@ -93,6 +93,36 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         assert (folder / name).stat().st_size > 0, name
 
 
+def test_the_image_of_a_closed_mesh_is_a_closed_mesh(made, files):
+    folder, f = made
+    ball = trimesh.load(files / "ball.obj", process=False)
+    egg = trimesh.load(files / "egg.obj", process=False)
+    mapped = trimesh.load(folder / "mapped.obj", process=False, maintain_order=True)
+    assert f.metrics["seam_gap_max_percent"] > 0
+    image = np.load(folder / "mapped_vertices.npy")
+    assert image.shape == ball.vertices.shape
+    assert point_mesh_distance(image, np.asarray(egg.vertices), egg.faces).max() < 1e-6
+    assert np.allclose(image, f.target.in_original_units(f.welded_image))
+    # in the file: the source's vertices and faces, with texture coordinates of their own
+    lines = (folder / "mapped.obj").read_text().splitlines()
+    vertices = np.array([line.split()[1:] for line in lines if line.startswith("v ")], dtype=float)
+    rows = [line.split()[1:] for line in lines if line.startswith("f ")]
+    faces = np.array([[int(corner.split("/")[0]) for corner in row] for row in rows]) - 1
+    assert np.allclose(vertices, image, atol=1e-6)
+    assert {tuple(sorted(f)) for f in faces.tolist()} == {
+        tuple(sorted(f)) for f in ball.faces.tolist()
+    }
+    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
+    assert np.allclose(mapped.area, trimesh.Trimesh(vertices, faces).area, rtol=1e-6)
+    assert f.metrics["welded_flipped_triangles"] == 0
+    diagonal = f.target.surface.bounding_box_diagonal
+    moves = np.linalg.norm(f.weld.points - f.image, axis=1)
+    assert f.metrics["welded_move_max_percent"] == pytest.approx(100 * moves.max() / diagonal)
+    # landmarks stay
+    first = f.source.surface.cut_vertex[f.landmarks[:, 0]]
+    assert np.allclose(f.weld.points[first], f.image[first], atol=1e-9)
+
+
 def test_a_map_is_given_back_as_it_was(made):
     folder, f = made
     again = nsm.load(folder)

@@ -1,0 +1,221 @@
+"""Maps of closed surfaces, on the disc and without a seam, side by side: one JSON for each case.
+
+Existing files are kept, so that an interrupted run continues where it stopped:
+
+    python benchmarks/closed_maps.py --meshes FOLDER [--only CASE ...]
+
+Seconds are the CPU time of a map on one thread, from trained surfaces, with its figures and
+certificate. The four animals are prepared together, as for a collection, other pairs as pairs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+import json
+import platform
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+
+import nsm
+
+RESULTS = Path(__file__).parent / "results" / "closed_maps"
+ANIMALS = ("shrec07-381", "shrec07-384", "shrec07-388", "shrec07-393")
+FURTHER = (("385", "391"), ("392", "383"), ("395", "397"), ("398", "400"))
+KEPT = (
+    "symmetric_dirichlet_median",
+    "symmetric_dirichlet_mean",
+    "symmetric_dirichlet_p95",
+    "flipped_percent",
+    "landmark_error_mean_percent",
+    "landmark_error_max_percent",
+    "seam_gap_mean_percent",
+    "seam_gap_max_percent",
+    "certified",
+)
+START = ["trainer.max_steps=1", "artefacts=false", "certification.repair=false"]  # fills the cache
+
+
+def timed(make: Callable[[], Any]) -> tuple[Any, float]:
+    start = time.process_time()
+    result = make()
+    return result, round(time.process_time() - start, 1)
+
+
+def figures(f: Any, seconds: float) -> dict[str, Any]:
+    surfaces = {
+        phi.surface.name: {"rms_percent": phi.metrics["rms_percent"], "log": list(phi.surface.log)}
+        for phi in (f.source, f.target)
+    }
+    found = {key: f.metrics[key] for key in KEPT if key in f.metrics}
+    return {"map_seconds": seconds, **found, "surfaces": surfaces}
+
+
+def pair(source: Any, target: Any, landmarks: Any, domain: str) -> dict[str, Any]:
+    """A map of two files, or of two ready surfaces."""
+    settings = ["artefacts=false"]
+    if not isinstance(source, nsm.NeuralSurface):
+        start = nsm.map_pair(
+            source, target, landmarks, overrides=[*START, f"domain={domain}"], progress=False
+        )
+        source, target, landmarks = start.source, start.target, start.landmarks.tolist()
+    f, seconds = timed(
+        lambda: nsm.map_pair(source, target, landmarks, overrides=settings, progress=False)
+    )
+    return figures(f, seconds)
+
+
+@functools.cache
+def prepared(files: tuple[str, ...], marks: tuple[str, ...], domain: str) -> Any:
+    """Surfaces that are prepared together, with their landmarks."""
+    settings = [*START, f"domain={domain}"]
+    start = nsm.map_collection(list(files), list(marks), overrides=settings, progress=False)
+    return start.surfaces, start.landmarks
+
+
+def of_collection(files: Sequence[str], marks: Sequence[str], i: int, j: int, domain: str) -> Any:
+    """A pair of surfaces that were prepared together with others."""
+    surfaces, landmarks = prepared(tuple(files), tuple(marks), domain)
+    return pair(surfaces[i], surfaces[j], landmarks[:, [i, j]].tolist(), domain)
+
+
+def collection(files: Sequence[str], marks: Sequence[str], domain: str) -> dict[str, Any]:
+    """The collection: figures of the pairs, and the time of all."""
+    settings = [f"domain={domain}", "artefacts=false"]
+    nsm.map_collection(files, marks, overrides=[*settings, START[0]], progress=False)
+    group, seconds = timed(
+        lambda: nsm.map_collection(files, marks, overrides=settings, progress=False)
+    )
+    every = group.metrics["pairs"].values()
+    worst = {
+        key: max(of[key] for of in every)
+        for key in ("landmark_error_max_percent", "seam_gap_max_percent")
+        if all(key in of for of in every)
+    }
+    averages = {key: mean(of[key] for of in every) for key in KEPT[:4]}
+    cycles = {key: value for key, value in group.metrics.items() if key.startswith("cycle")}
+    certified = {"certified": group.metrics["certified"]}
+    return {"map_seconds": seconds, **averages, **worst, **cycles, **certified}
+
+
+def rings(folder: Path) -> tuple[list[str], list[list[int]]]:
+    """Two closed surfaces of genus 1 that are bent differently, with eight common landmarks."""
+    mesh = trimesh.creation.torus(
+        major_radius=1.0, minor_radius=0.35, major_sections=96, minor_sections=40
+    )
+    points = np.asarray(mesh.vertices)
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    first = points * (1 + 0.25 * np.sin(3 * angle))[:, None]
+    second = points * [1.5, 0.9, 1.0]
+    second[:, 2] += 0.5 * np.sin(2 * angle)
+    files = []
+    for name, vertices in (("wavy_ring", first), ("bent_ring", second)):
+        files.append(str(folder / f"{name}.obj"))
+        trimesh.Trimesh(vertices, mesh.faces, process=False).export(files[-1])
+    marks = np.linspace(0, len(points) - 1, 9)[:-1].astype(int).tolist()
+    return files, [[v, v] for v in marks]
+
+
+def cases(meshes: Path, scratch: Path) -> dict[str, tuple[str, Callable[[str], dict[str, Any]]]]:
+    """For each name the closed domain, and what is done on a domain."""
+    marks = meshes / "landmarks"
+    result: dict[str, tuple[str, Callable[[str], dict[str, Any]]]] = {}
+
+    def add(name: str, files: Sequence[str], landmarks: Any, domain: str = "orbifold") -> None:
+        result[name] = (domain, lambda on: pair(*files, landmarks, on))
+
+    four = [str(meshes / f"{name}.off") for name in ANIMALS]
+    points = [str(marks / f"{name}.vts") for name in ANIMALS]
+    for i, j in itertools.permutations(range(len(ANIMALS)), 2):
+        name = f"{ANIMALS[i][-3:]}-{ANIMALS[j][-3:]}"
+        result[name] = ("orbifold", lambda on, i=i, j=j: of_collection(four, points, i, j, on))  # type: ignore[misc]
+    both = [str(meshes / f"cat_horse-{k}.obj") for k in (0, 1)]
+    texts = [str(marks / f"cat_horse-{k}.txt") for k in (0, 1)]
+    add("cat-horse", both, texts)
+    add("busts 302-314", *_shapes(meshes, ("302", "314"), "vts"))
+    add("plane-bird 61-248", *_shapes(meshes, ("61", "248"), "pinned"))
+    add("genus 1", *rings(scratch), "torus")
+    add("horse-cat", both[::-1], texts[::-1])
+    for ends in FURTHER:
+        add("-".join(ends), *_shapes(meshes, ends, "vts"))
+    result["collection"] = ("orbifold", lambda on: collection(four, points, on))
+    return result
+
+
+def _shapes(meshes: Path, numbers: Sequence[str], ending: str) -> tuple[list[str], list[str]]:
+    files = [str(meshes / f"shrec07-{n}.off") for n in numbers]
+    return files, [str(meshes / "landmarks" / f"shrec07-{n}.{ending}") for n in numbers]
+
+
+COLUMNS = {
+    "symmetric_dirichlet_median": "median",
+    "symmetric_dirichlet_mean": "mean",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "landmark_error_max_percent": "landmark error, largest %",
+    "seam_gap_max_percent": "torn by at most %",
+    "map_seconds": "seconds",
+}
+
+
+def tables() -> str:
+    """All results as Markdown; the distortion is symmetric Dirichlet."""
+    files = sorted(RESULTS.glob("*.json"))
+    results = [json.loads(f.read_text()) for f in files]
+    head = ["map", "domain", *COLUMNS.values(), "certified"]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    ratios: dict[str, list[float]] = {key: [] for key in COLUMNS}
+    for found in results:
+        closed = found["closed_domain"]
+        for domain in ("disc", closed):
+            of = found[domain]
+            row = [f"{of[key]:.2f}" if key in of else "–" for key in COLUMNS]
+            name = found["case"] if domain == "disc" else ""
+            certified = "yes" if of["certified"] else "no"
+            lines.append("| " + " | ".join([name, domain, *row, certified]) + " |")
+        for key, values in ratios.items():
+            if key in found["disc"] and key in found[closed]:
+                values.append(found[closed][key] / found["disc"][key])
+    means = [
+        f"{label} {mean(values):.2f}"
+        for (key, label), values in zip(COLUMNS.items(), ratios.values(), strict=True)
+        if values and "landmark" not in key
+    ]
+    return (
+        "\n".join(lines) + f"\n\nClosed domain over disc, mean of the ratios: {', '.join(means)}.\n"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--meshes", type=Path, default=Path("../shared/meshes"))
+    parser.add_argument("--only", nargs="*", help="cases to run; all by default")
+    arguments = parser.parse_args()
+    if not arguments.meshes.is_dir():
+        parser.error(f"{arguments.meshes}: no such folder; give one with --meshes")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, (closed, run) in cases(arguments.meshes, Path(scratch)).items():
+            file = RESULTS / f"{name.replace(' ', '_')}.json"
+            if file.exists() or (arguments.only and name not in arguments.only):
+                continue
+            print(name, flush=True)
+            about = {"torch": torch.__version__, "machine": platform.machine()}
+            found = {"case": name, "closed_domain": closed, **about}
+            found |= {domain: run(domain) for domain in ("disc", closed)}
+            file.write_text(json.dumps(found, indent=2) + "\n")
+    text = tables()
+    (RESULTS.parent / "closed_maps.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""What the search for correspondences knows of a shape: a coarse mesh, its tips, its distances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from nsm.domains.orbifold.cones import decimated, extremities
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+
+_FACES = 1000
+_TIPS = 8
+_SAMPLES = 64
+
+
+@dataclass(frozen=True)
+class CoarseShape:
+    """A closed surface of genus 0 on about a thousand triangles, of area one.
+
+    Attributes:
+        vertices: (V, 3), about the mean of the surface.
+        faces: (F, 3).
+        ids: (V,) the vertices of the given mesh that are left.
+        distance: (V, V) geodesic, along edges.
+        mean_distance: (V,) to all points of the surface.
+        tips: (K,) vertices far from everything, the most prominent first.
+        samples: (M,) vertices that are spread evenly.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    ids: np.ndarray
+    distance: np.ndarray
+    mean_distance: np.ndarray
+    tips: np.ndarray
+    samples: np.ndarray
+
+
+def coarse_shape(vertices: np.ndarray, faces: np.ndarray) -> CoarseShape:
+    """The coarse shape of a closed mesh (V, 3), (F, 3) of genus 0.
+
+    Raises:
+        NsmError: ``wrong_topology`` for any other mesh; ``no_proposal`` for one with fewer than
+            four tips.
+    """
+    closed = bool((topology.edges_of(faces).count == 2).all())
+    if (
+        not closed
+        or topology.face_components(faces).max()
+        or topology.euler_characteristic(faces) != 2
+    ):
+        raise NsmError(
+            "correspondences without landmarks need closed surfaces of genus 0; give landmarks",
+            kind="wrong_topology",
+            key="landmarks",
+        )
+    tips = extremities(vertices, faces, _TIPS)
+    if len(tips) < 4:
+        raise NsmError(
+            f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",
+            kind="no_proposal",
+            key="landmarks",
+        )
+    coarse, ids = decimated(vertices, faces, _FACES, tips)
+    points = vertices[ids]
+    area = topology.face_areas(points, coarse)
+    corner = np.bincount(coarse.ravel(), np.repeat(area / 3, 3), minlength=len(ids)) / area.sum()
+    points = (points - corner @ points) / np.sqrt(area.sum())
+    distance = edge_distances(points, coarse)
+    tips = np.searchsorted(ids, tips)
+    return CoarseShape(
+        points,
+        coarse,
+        ids,
+        distance,
+        distance @ corner,
+        tips,
+        _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
+    )
+
+
+def edge_distances(
+    vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray | None = None
+) -> np.ndarray:
+    """Lengths (S, V) of shortest paths along edges, from sources (S,) or from all vertices."""
+    pairs = topology.edges_of(faces).pairs
+    length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1).clip(1e-300)
+    n = len(vertices)
+    graph = csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(dijkstra(graph, directed=False, indices=sources))
+
+
+def _spread(distance: np.ndarray, chosen: list[int], count: int) -> np.ndarray:
+    """The chosen vertices and, one by one, those farthest from them: (count,)."""
+    chosen = list(chosen)
+    nearest = distance[chosen].min(axis=0)
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, distance[chosen[-1]])
+    return np.array(chosen[:count])

@@ -1,0 +1,185 @@
+"""The search for maps of two coarse shapes: from fours of tips to a few trained maps.
+
+Four tips at the cones of the orbifold give a map, injective and orientation-preserving, in one
+sparse solve. How well it keeps geodesic distances chooses some hundreds among thousands; these are
+trained for a moment, and the least distorted ones again with finer waves (the criterion of ENIGMA:
+Edelstein, Ezuz and Ben-Chen 2020, "Evolutionary non-isometric geometry matching").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+import torch
+
+from nsm.correspondence.coarse_shape import CoarseShape
+from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
+from nsm.correspondence.refinement import Batch, Sines, refined
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.embedding import SIDE
+
+_SOURCE_SETS = 4
+_TARGET_SETS = 20
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of trainings: how many maps, their largest wave, and steps."""
+
+    maps: int
+    largest: int
+    steps: int
+
+
+ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A map of the orbifold to itself, x ↦ B (x + n(x)) + c, between two layouts.
+
+    Attributes:
+        source, target: the layouts.
+        table: of the target.
+        matrix, shift: B (2, 2) and c (2,), in coordinates of Ω.
+        largest: of the waves of n.
+        amplitudes: (K, 2) of the waves.
+        cost: what orders candidates: of the last round the mean symmetric Dirichlet energy.
+    """
+
+    source: Layout
+    target: Layout
+    table: Table
+    matrix: np.ndarray
+    shift: np.ndarray
+    largest: int
+    amplitudes: np.ndarray
+    cost: float
+
+    def planar(self, x: np.ndarray) -> np.ndarray:
+        """Points (N, 2) of the source's Ω to points (N, 2) of the target's."""
+        moved = x + Sines.up_to(self.largest).basis(x)[0] @ self.amplitudes
+        return np.asarray(moved @ self.matrix.T + self.shift)
+
+    def images(self, vertices: np.ndarray) -> np.ndarray:
+        """Vertices (N,) of the target near the images of vertices (N,) of the source."""
+        return self.table.near(self.planar(self.source.embedding.uv[vertices]))
+
+    def cones(self) -> np.ndarray:
+        """The tips at the cones of the source, and those that they go to: (4, 2) vertices."""
+        image = SIDE * group.CONES @ self.matrix.T + self.shift
+        corner = np.mod(np.rint(image).astype(int), 2)
+        wanted = np.rint(SIDE * group.CONES).astype(int)
+        at = [int(np.flatnonzero((wanted == c).all(axis=1))[0]) for c in corner]
+        ours, theirs = self.source, self.target
+        return np.stack([ours.shape.tips[ours.tips], theirs.shape.tips[theirs.tips[at]]], axis=1)
+
+
+def candidates(
+    source: CoarseShape, target: CoarseShape, rounds: Sequence[Round] = ROUNDS
+) -> list[Candidate]:
+    """Maps of the source to the target that may be right, least distorted first."""
+    sets, scores = quick_scores(source)
+    ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]])
+    theirs = _laid_out(target, _similar_sets(ours, target))
+    tables = [table(one) for one in theirs]
+    found = [
+        candidate
+        for s in ours
+        for t, looked_up in zip(theirs, tables, strict=True)
+        for candidate in _starts(s, t, looked_up)
+    ]
+    for one in rounds:
+        found = _trained(sorted(found, key=lambda c: c.cost)[: one.maps], one)
+    return sorted(found, key=lambda c: c.cost)
+
+
+def distance_change(candidate: Candidate) -> float:
+    """Mean difference of geodesic distances between samples and between their images."""
+    s, t = candidate.source.shape, candidate.target.shape
+    return float(_changes(s, t, candidate.images(s.samples)))
+
+
+def rigid_residual(candidate: Candidate) -> float:
+    """Root mean square distance of samples, moved rigidly, to their images."""
+    s, t = candidate.source.shape, candidate.target.shape
+    p, q = s.vertices[s.samples], t.vertices[candidate.images(s.samples)]
+    p, q = p - p.mean(axis=0), q - q.mean(axis=0)
+    left, _, right = np.linalg.svd(p.T @ q)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return float(np.sqrt(((p @ left @ flip @ right - q) ** 2).sum(axis=1).mean()))
+
+
+def _laid_out(shape: CoarseShape, sets: np.ndarray) -> list[Layout]:
+    every = [layout(shape, four) for four in sets]
+    return [one for one in every if one is not None]
+
+
+def _similar_sets(ours: Sequence[Layout], target: CoarseShape) -> np.ndarray:
+    """Sets (S, 4) of the target's tips whose distances are those of one of the source's sets."""
+    apart = target.distance[np.ix_(target.tips, target.tips)]
+    mean = target.mean_distance[target.tips]
+    orders = np.array(list(permutations(range(len(target.tips)), 4)))
+    rows, columns = np.triu_indices(4, 1)
+    best: dict[tuple[int, ...], float] = {}
+    for one in ours:
+        shape, tips = one.shape, one.shape.tips[one.tips]
+        wanted = shape.distance[tips[rows], tips[columns]]
+        cost = np.abs(wanted - apart[orders[:, rows], orders[:, columns]]).mean(axis=1)
+        cost += np.abs(shape.mean_distance[tips] - mean[orders]).mean(axis=1)
+        for value, four in zip(cost.tolist(), np.sort(orders, axis=1).tolist(), strict=True):
+            best[tuple(four)] = min(best.get(tuple(four), np.inf), value)
+    return np.array(sorted(best, key=lambda four: best[four])[:_TARGET_SETS])
+
+
+def _starts(source: Layout, target: Layout, looked_up: Table) -> list[Candidate]:
+    """The affine maps between two layouts, with the change of distances for their cost."""
+    nothing = np.zeros((0, 2))
+    made = [
+        Candidate(source, target, looked_up, matrix, shift, 0, nothing, 0.0)
+        for matrix, shift in affine_maps(source, target)
+    ]
+    images = np.stack([candidate.images(source.shape.samples) for candidate in made])
+    costs = _changes(source.shape, target.shape, images)
+    return [replace(c, cost=float(cost)) for c, cost in zip(made, costs, strict=True)]
+
+
+def _changes(source: CoarseShape, target: CoarseShape, images: np.ndarray) -> np.ndarray:
+    """Mean difference (...) of distances between samples and between images (..., M) of them."""
+    before = source.distance[np.ix_(source.samples, source.samples)]
+    after = target.distance[images[..., :, None], images[..., None, :]]
+    return np.asarray(np.abs(before - after).mean(axis=(-1, -2)))
+
+
+def _trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
+    """The candidates after a round of trainings; those of one source's layout in one batch."""
+    waves = len(Sines.up_to(one.largest).waves)
+    by_source: dict[int, list[Candidate]] = {}
+    for candidate in found:
+        by_source.setdefault(id(candidate.source), []).append(candidate)
+    result = []
+    for group_ in by_source.values():
+        tables = list({id(c.table): c.table for c in group_}.values())
+        number = {id(t): k for k, t in enumerate(tables)}
+        batch = Batch(
+            group_[0].source,
+            tables,
+            np.array([number[id(c.table)] for c in group_]),
+            np.stack([c.matrix for c in group_]),
+            np.stack([c.shift for c in group_]),
+            one.largest,
+        )
+        start = torch.zeros(len(group_), waves, 2)
+        for k, candidate in enumerate(group_):  # few waves come first among many
+            start[k, : len(candidate.amplitudes)] = torch.as_tensor(candidate.amplitudes)
+        amplitudes, energies = refined(batch, start, one.steps)
+        result += [
+            replace(c, largest=one.largest, amplitudes=a, cost=e)
+            for c, a, e in zip(
+                group_, amplitudes.numpy().astype(float), energies.tolist(), strict=True
+            )
+        ]
+    return result

@@ -1,0 +1,24 @@
+"""The domain that suits surfaces, by their topology."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from nsm.domains.base import Domain
+from nsm.domains.names import DOMAINS
+
+# by genus and number of boundary loops
+_CLOSED = {(0, 0): "orbifold", (1, 0): "torus"}
+
+
+@dataclass(frozen=True)
+class Automatic:
+    """Stands for a domain until the surfaces are known: closed surfaces of genus 0 or 1 need no
+    seam on an orbifold or torus; others are cut to a disc."""
+
+    def chosen(self, topologies: Collection[tuple[int, int]]) -> Domain:
+        """The domain for surfaces of given genus and number of boundary loops."""
+        kinds = set(topologies)
+        name = _CLOSED.get(next(iter(kinds)), "disc") if len(kinds) == 1 else "disc"
+        return DOMAINS[name]

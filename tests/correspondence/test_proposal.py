@@ -1,0 +1,132 @@
+"""Proposals without landmarks on shapes whose correspondence is known."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from nsm.correspondence import proposed
+from nsm.correspondence.coarse_shape import coarse_shape
+from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
+from nsm.correspondence.search import Candidate
+from nsm.domains.orbifold import group
+from nsm.domains.orbifold.cover import lifted_near, located
+from nsm.errors import NsmError
+from nsm.surfaces.shapes import hemisphere, torus
+
+# directions of limbs, and their lengths: no symmetry takes them to one another
+LIMBS = {
+    (1.0, 0.0, 0.2): 2.6,
+    (-0.3, 1.0, 0.0): 1.9,
+    (-0.8, -0.7, 0.1): 1.3,
+    (0.1, -0.2, 1.0): 1.6,
+    (0.3, -0.9, -0.6): 2.2,
+}
+
+
+def star(lengths, width=0.35):
+    """A ball with limbs, as vertices and faces, and the vertices at the limbs' tips."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    points = np.array(ball.vertices)
+    along = np.array(list(LIMBS)) / np.linalg.norm(list(LIMBS), axis=1)[:, None]
+    angle = np.arccos(np.clip(points @ along.T, -1, 1))
+    radius = 1 + np.exp(-((angle / width) ** 2)) @ np.array(lengths)
+    return radius[:, None] * points, np.array(ball.faces), angle.argmin(axis=0)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A shape, and the same with other lengths, turned, with other numbers and in another unit."""
+    rng = np.random.default_rng(0)
+    lengths = np.array(list(LIMBS.values()))
+    vertices, faces, tips = star(lengths)
+    other, _, _ = star(lengths * rng.uniform(0.9, 1.1, 5))
+    turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    number = rng.permutation(len(other))
+    moved = np.empty_like(other)
+    moved[number] = 40 * other @ turn.T + [5, 6, 7]
+    return (vertices, faces), (moved, number[faces]), (tips, number[tips])
+
+
+def test_a_turned_and_stretched_shape_is_recognised(pair):
+    source, target, tips = pair
+    proposal = proposed(source, target)
+    assert proposal.sure
+    best = proposal.hypotheses[0]
+    assert 4 <= len(best.vertices) <= 5
+    for p, q in best.vertices:  # each near the tip of one and the same limb
+        limb = np.linalg.norm(source[0][tips[0]] - source[0][p], axis=1)
+        its = np.linalg.norm(target[0][tips[1]] - target[0][q], axis=1)
+        assert limb.argmin() == its.argmin()
+        assert limb.min() < 0.3 and its.min() < 40 * 0.3  # limbs are 1.3 long or more
+    scores = [h.score for h in proposal.hypotheses]
+    assert scores == sorted(scores) and proposal.margin == pytest.approx(scores[1] - scores[0])
+    assert best.energy < 5 and best.distance_change < 0.05
+
+
+def test_nothing_is_sure_where_all_is_alike():
+    """Four equal limbs, as a tetrahedron has corners: twelve rotations are equally good."""
+    corners = [(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)]
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    points = np.array(ball.vertices)
+    angle = np.arccos(np.clip(points @ np.array(corners).T / np.sqrt(3), -1, 1))
+    mesh = (1 + 2 * np.exp(-((angle / 0.35) ** 2)).sum(axis=1))[:, None] * points
+    proposal = proposed((mesh, np.array(ball.faces)), (mesh, np.array(ball.faces)))
+    assert not proposal.sure
+    assert len(proposal.hypotheses) > 1
+
+
+@pytest.mark.parametrize("mesh", [torus(), hemisphere()])
+def test_other_topologies_are_refused(mesh):
+    with pytest.raises(NsmError) as refused:
+        coarse_shape(*mesh)
+    assert (refused.value.kind, refused.value.key) == ("wrong_topology", "landmarks")
+
+
+@pytest.fixture(scope="module")
+def layouts(pair):
+    shape = coarse_shape(*pair[0])
+    sets, scores = quick_scores(shape)
+    assert len(sets) == len(scores) and np.isfinite(scores).all()
+    return layout(shape, sets[scores.argmin()]), layout(shape, sets[np.argsort(scores)[1]])
+
+
+def test_a_coarse_shape_has_area_one_and_distances(pair):
+    shape = coarse_shape(*pair[0])
+    corner = shape.vertices[shape.faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    assert np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(1)
+    straight = np.linalg.norm(shape.vertices[:, None] - shape.vertices[None], axis=2)
+    assert (shape.distance >= straight - 1e-9).all()
+    assert shape.distance == pytest.approx(shape.distance.T)
+    tips = pair[0][0][shape.ids[shape.tips]]
+    limbs = pair[0][0][pair[2][0]]
+    apart = np.linalg.norm(tips[:, None] - limbs[None], axis=2)
+    assert (apart.min(axis=0) < 0.3).all()  # each limb's tip is found
+
+
+def test_tables_have_the_symmetries_of_the_orbifold(layouts):
+    one = layouts[0]
+    looked_up = table(one)
+    rng = np.random.default_rng(0)
+    n = len(looked_up.vertex)
+    points = 2 * rng.integers(-n, n, (300, 2)) / n  # points of the grid: nothing is rounded
+    for image in (-points, points + [2, 0], [4, -2] - points):
+        assert np.array_equal(looked_up.near(image), looked_up.near(points))
+    places = located(one.embedding, points)
+    corners = one.shape.faces[places.face]
+    assert (corners == looked_up.near(points)[:, None]).any(axis=1).mean() > 0.98
+
+
+def test_affine_maps_take_cones_to_cones_in_all_orders(layouts):
+    source, target = layouts
+    looked_up, orders = table(target), set()
+    for matrix, shift in affine_maps(source, target):
+        assert round(np.linalg.det(matrix)) == 1
+        found = Candidate(source, target, looked_up, matrix, shift, 0, np.zeros((0, 2)), 0.0)
+        cones = found.cones()
+        assert cones[:, 0].tolist() == source.embedding.cones.tolist()
+        image = found.planar(2 * group.CONES)
+        at = np.array([np.flatnonzero(target.embedding.cones == v)[0] for v in cones[:, 1]])
+        assert lifted_near(2 * group.CONES[at], image, True) == pytest.approx(image)
+        orders.add(tuple(at.tolist()))
+    assert len(orders) == 24

@@ -1,0 +1,127 @@
+"""Short trainings: sines with the symmetries of Ω, energies against closed forms, descent."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from thorough import examples
+
+from nsm.correspondence.layouts import _logarithm
+from nsm.correspondence.refinement import Batch, Sines, _exponential, refined
+
+RNG = np.random.default_rng(0)
+POINTS = RNG.uniform(-1, 1, (200, 2))
+
+
+def flat(tables, matrices, shifts, largest=2, metric=None):
+    """A batch whose source is the plane: the unit square metric at random points."""
+    count = len(POINTS)
+    inverse = np.tile(np.eye(2) if metric is None else np.linalg.inv(metric), (count, 1, 1))
+    source = SimpleNamespace(at=POINTS, inverse=inverse, area=np.full(count, 1 / count))
+    return Batch(
+        source,
+        [SimpleNamespace(log_metric=t) for t in tables],
+        np.arange(len(matrices)) % len(tables),
+        np.array(matrices),
+        np.array(shifts),
+        largest,
+    )
+
+
+def constant(metric, cells=8):
+    return np.broadcast_to(_logarithm(metric[None])[0], (cells, cells, 3)).copy()
+
+
+def symmetric_dirichlet(jacobian, epsilon=0.01):
+    m = jacobian.T @ jacobian
+    return np.trace(m) + np.trace(np.linalg.inv(m + epsilon * np.eye(2)))
+
+
+@given(st.integers(0, 4), st.integers(-3, 3), st.integers(-3, 3))
+@examples(20)
+def test_displacements_have_the_symmetries_of_the_orbifold(largest, m, n):
+    sines = Sines.up_to(largest)
+    assert len(sines.waves) == ((2 * largest + 1) ** 2 - 1) // 2
+    value = sines.basis(POINTS)[0]
+    assert np.allclose(sines.basis(-POINTS)[0], -value)
+    assert np.allclose(sines.basis(POINTS + 2 * np.array([m, n]))[0], value)
+    # a finer set begins with a coarser one
+    assert np.array_equal(Sines.up_to(largest + 1).waves[: len(sines.waves)], sines.waves)
+
+
+def test_derivatives_of_the_sines():
+    sines, step = Sines.up_to(3), 1e-6
+    basis = sines.basis(POINTS)
+    for axis in (0, 1):
+        move = step * np.eye(2)[axis]
+        difference = sines.basis(POINTS + move)[0] - sines.basis(POINTS - move)[0]
+        assert basis[1 + axis] == pytest.approx(difference / (2 * step), abs=1e-6)
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
+@examples(30)
+def test_exponentials_and_logarithms(m, a, b):
+    matrix = expm(np.array([[m + a, b], [b, m - a]]))
+    made = _exponential(torch.tensor([[m, a, b]], dtype=torch.float64))[0].numpy()
+    assert made == pytest.approx(matrix, rel=1e-6)
+    assert _logarithm(matrix[None])[0] == pytest.approx([m, a, b], abs=1e-9)
+
+
+@pytest.mark.parametrize("matrix", [((1, 0), (0, 1)), ((1, 1), (0, 1)), ((0, -1), (1, 2))])
+def test_the_energy_of_an_affine_map(matrix):
+    source, target = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[1.0, -0.4], [-0.4, 1.5]])
+    batch = flat([constant(target)], [matrix], [(1, 0)], metric=source)
+    found = batch.energies(torch.zeros(1, 12, 2)).item()
+    # both metrics are those of linear maps of the plane
+    a, b = np.linalg.cholesky(source).T, np.linalg.cholesky(target).T
+    expected = symmetric_dirichlet(b @ np.array(matrix) @ np.linalg.inv(a))
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_energy_of_a_map_that_is_not_affine():
+    """Against the map's Jacobians by finite differences, and the table's function itself."""
+    cells = 256
+    line = 2 * np.arange(cells) / cells
+    x, y = np.meshgrid(line, line, indexing="ij")
+
+    def log_metric(points):
+        u = np.cos(np.pi * points[..., 0]) * np.cos(np.pi * points[..., 1])
+        return np.stack([0.2 * u, 0.3 * u, -0.1 * u], axis=-1)
+
+    batch = flat([log_metric(np.stack([x, y], axis=-1))], [((1, 1), (0, 1))], [(1, 1)])
+    sines = Sines.up_to(2)
+    amplitudes = 0.05 * RNG.normal(size=(12, 2))
+
+    def image(points):
+        moved = points + sines.basis(points)[0] @ amplitudes
+        return moved @ np.array([[1, 1], [0, 1]]).T + 1
+
+    energy, step = 0.0, 1e-6
+    for p in POINTS:
+        moves = [(image((p + e)[None]) - image((p - e)[None]))[0] for e in step * np.eye(2)]
+        jacobian = np.stack(moves, axis=1) / (2 * step)
+        m, a, b = log_metric(image(p[None])[0])
+        root = np.linalg.cholesky(expm(np.array([[m + a, b], [b, m - a]]))).T
+        energy += symmetric_dirichlet(root @ jacobian) / len(POINTS)
+    found = batch.energies(torch.as_tensor(amplitudes[None], dtype=torch.float32)).item()
+    assert found == pytest.approx(energy, rel=1e-3)
+
+
+def test_training_finds_the_isometry():
+    """Each map of a batch goes down on its own; the least energy of all is that of isometries."""
+    torch.manual_seed(0)
+    turn = ((0, -1), (1, 0))
+    batch = flat([constant(np.eye(2))], [((1, 0), (0, 1)), turn, ((1, 2), (0, 1))], [(0, 0)] * 3)
+    start = 0.1 * torch.randn(3, 12, 2)
+    before = batch.energies(start)
+    amplitudes, energies = refined(batch, start, 80)
+    assert (energies < before).all()
+    assert torch.allclose(batch.energies(amplitudes), energies, rtol=1e-4)
+    least = symmetric_dirichlet(np.eye(2))
+    assert energies[:2].numpy() == pytest.approx([least, least], abs=0.02)
+    # the other isotopy class holds no isometry
+    assert energies[2] > 2 * least

@@ -1,0 +1,231 @@
+"""Maps of closed surfaces without a seam, as users run them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from domains.orbifold.shapes import limbs, torus
+
+import nsm
+from nsm.domains import Surface
+from nsm.domains.orbifold.alignment import alignments
+from nsm.errors import NsmError
+from nsm.results.metrics import evaluate
+
+QUICK = [
+    "experiment=quick",
+    "data.steps_per_epoch=50",
+    "data.held_out=512",
+    "trainer.threads=1",
+    "encoding.resolutions=[8,16]",
+    "trainer.max_steps=150",
+]
+MADE = (
+    'phi.overrides=["experiment=quick","trainer.threads=1","encoding.resolutions=[16,64]",'
+    '"trainer.max_steps=40"]'
+)
+
+
+def _exported(folder, name, vertices, faces):
+    trimesh.Trimesh(vertices, faces, process=False).export(folder / f"{name}.obj")
+    return folder / f"{name}.obj"
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory):
+    """Files of two shapes with equal vertex numbers, and landmarks: by domain."""
+    folder = tmp_path_factory.mktemp("meshes")
+    points, faces, tips = limbs()
+    bent = points * [1.2, 0.9, 1.1] + 0.15 * np.sin(points[:, [1, 2, 0]])
+    ring, ring_faces = torus((30, 14))
+    oval = ring * [1.3, 0.9, 1.0] + 0.1 * np.sin(ring[:, [1, 2, 0]])
+    far = np.linspace(0, len(ring) - 1, 7)[:-1].astype(int).tolist()
+    more = [int(v) for v in [points[:, 2].argmin()]] + [int(points[:, 2].argmax())]
+    return {
+        "orbifold": (
+            [_exported(folder, n, p, faces) for n, p in (("limbs", points), ("bent", bent))],
+            [*tips, *more],
+        ),
+        "torus": (
+            [_exported(folder, n, p, ring_faces) for n, p in (("ring", ring), ("oval", oval))],
+            far,
+        ),
+    }
+
+
+@pytest.fixture(scope="module", params=["orbifold", "torus"])
+def made(request, shapes, tmp_path_factory):
+    """A whole run from raw meshes with landmarks: folder, map, files and landmarks."""
+    folder = tmp_path_factory.mktemp("run") / "map"
+    files, marks = shapes[request.param]
+    overrides = [f"domain={request.param}", *QUICK, MADE]
+    pairs = [[v, v] for v in marks]
+    f = nsm.map_pair(*files, pairs, overrides=overrides, folder=folder, progress=False)
+    return folder, f, files, marks
+
+
+def test_the_map_is_a_certified_homeomorphism(made):
+    folder, f, _, _ = made
+    counts = {"flipped_triangles": 0, "torn_vertices": 0, "degree_error": 0}
+    assert f.certificate == {"certified": True, **counts}
+    summary = json.loads((folder / "metrics.json").read_text())
+    assert summary["certified"] and summary["metrics"]["torn_vertices"] == 0
+    assert not [key for key in f.metrics if "seam" in key or "boundary" in key]
+    assert f.metrics["covered_percent"] == 100
+    assert f.metrics["symmetric_dirichlet_median"] < 5
+    assert "homeomorphism" in f.statement
+
+
+def test_landmarks_are_met(made):
+    _, f, files, marks = made
+    source, target = (trimesh.load(file, process=False) for file in files)
+    off = np.linalg.norm(f(source.vertices[marks]) - target.vertices[marks], axis=1)
+    assert off.max() < 0.005 * np.linalg.norm(np.ptp(target.vertices, axis=0))
+
+
+def test_copies_of_a_vertex_have_one_image(made):
+    _, f, _, _ = made
+    s = f.source.surface
+    a, b = s.seam_pairs.T
+    assert len(a)
+    diagonal = f.target.surface.bounding_box_diagonal
+    assert np.abs(f.image[a] - f.image[b]).max() <= 1e-7 * diagonal
+    by_network = f.target(evaluate(f.map, s.uv))
+    assert np.abs(by_network[a] - by_network[b]).max() <= 1e-4 * diagonal
+
+
+def test_the_exports_are_closed_and_have_the_files_vertices_and_faces(made):
+    folder, f, files, _ = made
+    given = trimesh.load(files[0], process=False)
+    for name in ("mapped.obj", "morph/00.obj", "morph/08.obj", "source_with_target_uv.obj"):
+        mesh = trimesh.load(folder / name, process=False)
+        assert mesh.is_watertight and (mesh.faces == given.faces).all(), name
+    assert np.load(folder / "mapped_vertices.npy").shape == given.vertices.shape
+    mapped = trimesh.load(folder / "mapped.obj", process=False)
+    np.testing.assert_allclose(mapped.vertices, np.load(folder / "mapped_vertices.npy"), rtol=1e-6)
+    assert mapped.volume > 0
+
+
+def test_the_inverse_leads_back(made):
+    _, f, _, _ = made
+    s, t = f.source.surface, f.target.surface
+    there = f.planar(f.source_uv)
+    lifted = s.domain.lift(torch.as_tensor(there), torch.as_tensor(t.uv)).numpy()
+    np.testing.assert_allclose(lifted, t.uv, atol=1e-6)
+    # the inverse is continuous across what is a copy of a vertex in the plane: one lift a triangle
+    np.testing.assert_allclose(there, t.uv, atol=1e-6)
+
+
+def test_signals_go_over_and_back(made):
+    _, f, files, _ = made
+    source = trimesh.load(files[0], process=False)
+    back = f.transfer(f.transfer(source.vertices[:, 0]), back=True)
+    assert np.abs(back - source.vertices[:, 0]).mean() < 0.05 * np.ptp(source.vertices[:, 0])
+    assert f.transfer(np.ones(len(source.vertices))) == pytest.approx(1.0)
+
+
+def test_a_stored_map_is_the_same(made):
+    folder, f, files, _ = made
+    again = nsm.load(folder)
+    points = trimesh.load(files[0], process=False).triangles_center
+    np.testing.assert_array_equal(again(points), f(points))
+    assert again.certificate == f.certificate
+
+
+def test_the_viewer_shows_no_seam(made):
+    from nsm.results.view.scene import scene_of
+
+    _, f, _, _ = made
+    scene = scene_of(f)
+    assert not len(scene.source.seam) and not len(scene.target.seam)
+    places = scene.target.uv[:5]
+    found = scene.corresponding(
+        1, f.target.surface.domain.locate(places, f.target.surface.uv, f.target.surface.faces)
+    )
+    there = torch.as_tensor(found.take(f.image_uv, f.source.surface.faces))
+    lifted = f.target.surface.domain.lift(there, torch.as_tensor(places)).numpy()
+    np.testing.assert_allclose(lifted, places, atol=1e-6)
+
+
+def test_ready_surfaces_of_their_own_cones_are_aligned(shapes):
+    """Each laid out on its own: their cones are landmarks in common in another order."""
+    files, marks = shapes["orbifold"]
+    tips = marks[:4]
+    first = Surface.load(files[0], domain="orbifold", cones=tips, cache=False)
+    second = Surface.load(
+        files[1], domain="orbifold", cones=[tips[k] for k in (2, 3, 0, 1)], cache=False
+    )
+    overrides = ["experiment=quick", "trainer.threads=1", "artefacts=false"]
+    overrides += ["encoding.resolutions=[16,64]", "trainer.max_steps=40"]
+    phi, psi = (nsm.overfit(s, overrides=overrides, progress=False) for s in (first, second))
+    pairs = [[v, v] for v in marks]
+    overrides = [*QUICK, "artefacts=false"]
+    f = nsm.map_pair(phi, psi, pairs, overrides=overrides, progress=False)
+    assert f.certificate["certified"]
+    assert f.metrics["landmark_error_max_percent"] < 0.5
+    assert f.metrics["symmetric_dirichlet_median"] < 5
+
+
+def test_a_map_without_landmarks_is_a_homeomorphism(shapes):
+    files, _ = shapes["torus"]
+    f = nsm.map_pair(
+        *files, overrides=["domain=torus", *QUICK, MADE, "artefacts=false"], progress=False
+    )
+    assert f.certificate["certified"] and f.metrics["symmetric_dirichlet_median"] < 6
+    assert "landmark_error_max_percent" not in f.metrics
+
+
+@pytest.mark.parametrize("domain", ["orbifold", "torus"])
+def test_collections_are_certified_and_their_cycles_close(shapes, tmp_path, domain):
+    files, marks = shapes[domain]
+    third = trimesh.load(files[0], process=False)
+    path = _exported(tmp_path, "third", third.vertices[:, [1, 2, 0]] * [1, 1.2, 1], third.faces)
+    overrides = [f"domain={domain}", *QUICK, MADE, "trainer.max_steps=100"]
+    folder = tmp_path / "run"
+    g = nsm.map_collection(
+        [*files, path], [marks] * 3, overrides=overrides, folder=folder, progress=False
+    )
+    assert g.certificate["certified"] and "homeomorphism" in g.statement
+    assert g.metrics["cycle_error_max_percent"] < 3
+    assert g.metrics["cycle_error_networks_max_percent"] < 1e-2
+    again = nsm.load(folder)
+    points = third.triangles_center
+    np.testing.assert_allclose(again.pair(0, 2)(points), g.pair(0, 2)(points), atol=1e-6)
+
+
+def test_a_wrong_isotopy_class_is_noticed_and_the_next_is_tried(shapes, tmp_path, monkeypatch):
+    """The right class is second to a Dehn twist of it."""
+    from nsm.pipeline import pair_map
+
+    def with_the_twist_first(*arguments):
+        found = alignments(*arguments)
+        twist = np.array([[1, 2], [0, 1]])
+        return [replace(found[0], matrix=found[0].matrix @ twist), *found]
+
+    monkeypatch.setattr(pair_map, "alignments", with_the_twist_first)
+    files, marks = shapes["orbifold"]
+    overrides = ["domain=orbifold", *QUICK, MADE, "artefacts=false"]
+    f = nsm.map_pair(
+        *files,
+        [[v, v] for v in marks],
+        overrides=overrides,
+        folder=tmp_path / "run",
+        progress=False,
+    )
+    assert f.certificate["certified"] and f.metrics["symmetric_dirichlet_median"] < 5
+    summary = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert summary["isotopy_class"] == 1 and len(summary["isotopy_classes"]) > 1
+    assert f.config["isotopy_class"] == 1
+
+
+def test_a_class_that_is_not_there_is_refused(shapes):
+    files, marks = shapes["orbifold"]
+    overrides = ["domain=orbifold", *QUICK, MADE, "isotopy_class=500"]
+    with pytest.raises(NsmError) as error:
+        nsm.map_pair(*files, [[v, v] for v in marks], overrides=overrides, progress=False)
+    assert (error.value.kind, error.value.key) == ("out_of_range", "isotopy_class")
