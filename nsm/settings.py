@@ -410,6 +410,10 @@ class Settings:
             task=pair_map with two closed meshes of genus 0: landmarks are proposed.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
+        texture: of task=pair_map: an image for the source's texture coordinates; or own: the
+            materials of its file. It is baked to the target, as target_textured.obj and .glb; the
+            target's own texture, if it has one, to the source.
+        texture_size: texels a side of the baked images.
         loss_terms: your own terms: +loss_terms.mine._target_=mypackage.MyTerm
             +loss_terms.mine.weight=0.1.
         callbacks: Lightning callbacks: +callbacks.mine._target_=mypackage.MyCallback.
@@ -426,6 +430,8 @@ class Settings:
     target: str | dict[str, Any] | None = None
     surfaces: list[Any] | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
+    texture: str | None = None
+    texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)
     proposal: ProposalSettings = field(default_factory=ProposalSettings)
     isotopy_class: Whole = 0

@@ -22,6 +22,7 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 
@@ -81,6 +82,7 @@ class ParamTask(Task):
         for ending, texture in (("obj", None), ("glb", checkerboard())):
             file = folder / f"parameterized.{ending}"
             export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
+        write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
         before_after = {"before: domain Ω": surface.uv, "after": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
