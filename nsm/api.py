@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from nsm.command_line import prepared_overrides
 from nsm.config import compose_config, conf_folder, dotted, unknown_setting
 from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
@@ -47,7 +48,7 @@ def overfit(
         surface: the prepared surface.
         overrides: settings as on the command line, e.g. ``["trainer.max_steps=1000"]``.
         folder: where to leave the run's files; without it they are not kept.
-        progress: show a progress bar.
+        progress: show what goes on, and the figures at the end; without it nothing is printed.
         **settings: settings by name: a string chooses the option of a group, a dictionary sets
             the settings within, a class is what ``_target_`` names:
             ``activation="silu", trainer={"max_steps": 1000}, seed=1``.
@@ -65,7 +66,7 @@ def overfit(
     _expect(surface, Surface)
     request = _Request("overfit", overrides, settings, [surface])
     with request.run(folder, progress) as (config, place):
-        return run_task(config, place, given=Given(surface=surface))
+        return run_task(config, place, given=Given(surface=surface), quiet=not progress)
 
 
 def parameterize(
@@ -97,7 +98,7 @@ def parameterize(
     _expect(phi, NeuralSurface)
     request = _Request("param", overrides, settings, [phi.surface])
     with request.run(folder, progress) as (config, place):
-        return run_task(config, place, given=Given(phi=phi))
+        return run_task(config, place, given=Given(phi=phi), quiet=not progress)
 
 
 def map_pair(
@@ -137,7 +138,7 @@ def map_pair(
     request = _Request("pair_map", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
         given = Given(source=source, target=target, landmarks=landmarks)
-        return run_task(config, place, given=given)
+        return run_task(config, place, given=given, quiet=not progress)
 
 
 def map_collection(
@@ -171,7 +172,8 @@ def map_collection(
     ready = [phi.surface for phi in surfaces if isinstance(phi, NeuralSurface)]
     request = _Request("collection_map", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
-        return run_task(config, place, given=Given(surfaces=surfaces, landmarks=landmarks))
+        given = Given(surfaces=surfaces, landmarks=landmarks)
+        return run_task(config, place, given=given, quiet=not progress)
 
 
 # what the function that is called, and its arguments, say
@@ -204,6 +206,10 @@ class _Request:
                 kind="wrong_type",
                 key="overrides",
             )
+        settings = dict(settings)
+        if "device" in settings:
+            overrides = [*overrides, f"device={settings.pop('device')}"]
+        overrides = prepared_overrides(overrides)
         known = {key.partition(".")[0] for key in known_keys()}
         chosen, merged = [], {}
         for setting in dotted(settings):

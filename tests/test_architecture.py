@@ -11,7 +11,7 @@ PACKAGE = Path(nsm.__file__).parent
 # from left to right; a module imports from its own room and from those before it
 ROOMS = ["surfaces", "maps", "energies", "domains", "data", "tasks", "results", "pipeline"]
 # what every room may import
-COMMON = {"errors", "instantiation", "optional_dependencies", "settings"}
+COMMON = {"errors", "instantiation", "optional_dependencies", "settings", "stages"}
 # rooms that stand for themselves: meshes in numpy, and maps in torch
 INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}
 # a run knows its configuration, its folder, the sweep that it belongs to and the user's modules;

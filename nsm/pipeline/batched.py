@@ -228,7 +228,7 @@ def _ready(
     keep_absolute(run.config)
     key = f"{run.config.surface} {run.config.domain}"
     if key not in surfaces:
-        surfaces[key] = configured_surface(run.config)
+        surfaces[key] = configured_surface(run.config, console)
         report_surface(console, surfaces[key])
     return member(run, surfaces[key], console)
 

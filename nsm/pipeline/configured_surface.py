@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Surface, domain
+from nsm.stages import stage
 
 
 def keep_absolute(config: DictConfig) -> None:
@@ -16,22 +18,24 @@ def keep_absolute(config: DictConfig) -> None:
         config.surface.path = os.path.abspath(config.surface.path)
 
 
-def configured_surface(config: DictConfig) -> Surface:
-    """The surface of the group ``surface``, prepared.
+def configured_surface(config: DictConfig, console: Console) -> Surface:
+    """The surface of the group ``surface``, prepared; the console shows that it goes on.
 
     Raises:
         NsmError: a mesh that cannot be used.
     """
     keep_absolute(config)
     settings = config.surface
-    return Surface.load(
-        settings.path if settings.path is not None else settings.name,
-        domain=domain(config.domain),
-        seam_vertices=settings.seam_vertices,
-        cones=settings.get("cones"),  # absent in older run folders
-        parameterization=settings.parameterization,
-        cache=settings.cache,
-    )
+    given = settings.path if settings.path is not None else settings.name
+    with stage(console, f"preparing {Path(given).stem}"):
+        return Surface.load(
+            given,
+            domain=domain(config.domain),
+            seam_vertices=settings.seam_vertices,
+            cones=settings.get("cones"),  # absent in older run folders
+            parameterization=settings.parameterization,
+            cache=settings.cache,
+        )
 
 
 def report_surface(console: Console, surface: Surface) -> None:

@@ -41,7 +41,7 @@ class OverfitTask(Task):
 
     def prepare(self, given: Given) -> None:
         surface = given.surface
-        self.use(configured_surface(self.config) if surface is None else surface)
+        self.use(configured_surface(self.config, self.console) if surface is None else surface)
         report_surface(self.console, self.surface)
 
     def use(self, surface: Surface) -> None:

@@ -19,6 +19,7 @@ from nsm.pipeline.configured_surface import report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.results.analytic import lies_over
+from nsm.stages import stage
 from nsm.surfaces.catalogue import catalogue_mesh, catalogue_names
 from nsm.surfaces.landmarks import (
     Landmarks,
@@ -199,15 +200,16 @@ def neural_surfaces(
     ready = {k: shape for k, shape in enumerate(shapes) if isinstance(shape, NeuralSurface)}
     if meshes:
         alone = len(meshes) == 1
-        prepared = prepare_jointly(
-            list(meshes.values()),
-            [np.zeros(0, np.int64) if alone else landmarks[k] for k in meshes],
-            domain=domain(config.domain),
-            parameterization=config.surface.parameterization,
-            seam=config.seam.path,
-            seam_landmarks=config.seam.landmarks,
-            cache=config.surface.cache,
-        )
+        with stage(console, f"preparing {', '.join(mesh.name for mesh in meshes.values())}"):
+            prepared = prepare_jointly(
+                list(meshes.values()),
+                [np.zeros(0, np.int64) if alone else landmarks[k] for k in meshes],
+                domain=domain(config.domain),
+                parameterization=config.surface.parameterization,
+                seam=config.seam.path,
+                seam_landmarks=config.seam.landmarks,
+                cache=config.surface.cache,
+            )
         for surface in prepared:
             report_surface(console, surface)
         ready.update(zip(meshes, cached_surfaces(prepared, config, console), strict=True))

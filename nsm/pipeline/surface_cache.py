@@ -77,7 +77,7 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
                 key="phi.path",
             )
         return phi
-    surface = configured_surface(config)
+    surface = configured_surface(config, console)
     report_surface(console, surface)
     return cached_surfaces([surface], config, console)[0]
 
@@ -125,7 +125,7 @@ def _cached(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSu
 
 
 def _made(surface: Surface, overfit: DictConfig, folder: Path, console: Console) -> NeuralSurface:
-    run = Run(overfit, folder, resuming=(folder / CHECKPOINT_FILE).exists())
+    run = Run(overfit, folder, resuming=(folder / CHECKPOINT_FILE).exists(), inner=True)
     started, one = time.monotonic(), member(run, surface, console)
     phi: NeuralSurface = run_prepared(one.task, run, started)
     return phi
@@ -137,7 +137,9 @@ def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Cons
         for folder in sorted(missing):  # in one order, whichever process wants them
             locks.enter_context(FileLock(folder.with_suffix(".lock")))
         left = {folder: s for folder, s in missing.items() if not is_complete(folder)}
-        members = [member(Run(overfit, f, resuming=True), s, console) for f, s in left.items()]
+        members = [
+            member(Run(overfit, f, resuming=True, inner=True), s, console) for f, s in left.items()
+        ]
         stages = {one.run.stage for one in members}
         if len(members) < 2 or len(stages) > 1 or None in stages:
             return  # what was begun alone goes on alone
