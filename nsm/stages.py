@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 from rich.console import Console
 
 # seconds without a line after which one is printed where there is no terminal; in long runs the
 # share of the time that has passed, so that a log stays short
 QUIET_FOR, QUIET_SHARE = 2.0, 0.02
+
+T = TypeVar("T")
 
 
 class Stage:
@@ -53,7 +56,7 @@ class Stage:
                     status.update(self.text())
             return
         wait = QUIET_FOR
-        while not self._ended.wait(wait * 0.9):  # 0.9: the printing takes time as well
+        while not self._ended.wait(wait * 0.8):  # 0.8: others may hold the interpreter
             self.console.print(self.text(), soft_wrap=True)
             wait = max(QUIET_FOR, QUIET_SHARE * (time.monotonic() - self.started))
 
@@ -87,3 +90,10 @@ def at(step: str, done: int = 0, total: int = 0) -> None:
     shown = _current.get()
     if shown is not None:
         shown.at(step, done, total)
+
+
+def counted(step: str, items: Sequence[T]) -> Iterator[T]:
+    """The items, one after the other, each said to be a step of the work."""
+    for k, item in enumerate(items):
+        at(step, k, len(items))
+        yield item

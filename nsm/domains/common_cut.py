@@ -78,7 +78,6 @@ def best_common_cut(
             way = _common_cut(names, cleaned, landmarks, path, costs[path], count)
             if way is not None:
                 tried.append((_disagreement(way, landmarks), k, way))
-        at("laying out")
         best = min(tried, default=(0.0, 0, None))[2]
     else:
         best = _common_cut(names, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
@@ -175,7 +174,8 @@ def common_fractions(
     over the discs. The keys nearest to the domain's corners become the corners.
     """
     gaps = []
-    for cut, key in zip(_of_disc_area(cuts), keys, strict=True):
+    for k, (cut, key) in enumerate(zip(_of_disc_area(cuts), keys, strict=True)):
+        at("places on the boundary", k, len(cuts))
         uv = _DISC.embed(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
         angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
         gaps.append((np.roll(angle, -1) - angle) % 1.0)

@@ -94,7 +94,8 @@ class TrainingProgress(Callback):
         seconds = (now - self.started) / max(1, step - self.first_step)
         left = seconds * (trainer.max_steps - step)
         self.console.print(
-            f"{self.title}  step {step}/{trainer.max_steps}  left {left:.0f} s  {figures}"
+            f"{self.title}  step {step}/{trainer.max_steps}  left {left:.0f} s  {figures}",
+            soft_wrap=True,
         )
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
