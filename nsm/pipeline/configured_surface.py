@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
@@ -18,16 +19,23 @@ def keep_absolute(config: DictConfig) -> None:
         config.surface.path = os.path.abspath(config.surface.path)
 
 
-def configured_surface(config: DictConfig, console: Console) -> Surface:
+def configured_surface(config: DictConfig, console: Console, given: Any = None) -> Surface:
     """The surface of the group ``surface``, prepared; the console shows that it goes on.
+
+    Args:
+        given: a mesh in its place, as :meth:`Surface.load` takes it, or a prepared surface.
 
     Raises:
         NsmError: a mesh that cannot be used.
     """
+    if isinstance(given, Surface):
+        return given
     keep_absolute(config)
     settings = config.surface
-    given = settings.path if settings.path is not None else settings.name
-    with stage(console, f"preparing {Path(given).stem}"):
+    if given is None:
+        given = settings.path if settings.path is not None else settings.name
+    name = Path(given).stem if isinstance(given, (str, Path)) else "mesh"
+    with stage(console, f"preparing {name}"):
         return Surface.load(
             given,
             domain=domain(config.domain),

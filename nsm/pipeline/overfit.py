@@ -40,8 +40,7 @@ class OverfitTask(Task):
     start: Overfit | None = None
 
     def prepare(self, given: Given) -> None:
-        surface = given.surface
-        self.use(configured_surface(self.config, self.console) if surface is None else surface)
+        self.use(configured_surface(self.config, self.console, given.surface))
         report_surface(self.console, self.surface)
 
     def use(self, surface: Surface) -> None:

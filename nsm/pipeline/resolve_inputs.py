@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.domains import Domain, domain
+from nsm.domains import Domain, Surface, domain
 from nsm.domains.joint_preparation import Mesh, prepare_jointly
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
@@ -20,7 +19,8 @@ from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.results.analytic import lies_over
 from nsm.stages import stage
-from nsm.surfaces.catalogue import catalogue_mesh, catalogue_names
+from nsm.surfaces.catalogue import catalogue_names
+from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import (
     Landmarks,
     as_lists,
@@ -31,7 +31,6 @@ from nsm.surfaces.landmarks import (
     read_landmarks,
     read_pairs,
 )
-from nsm.surfaces.loading import load_mesh
 
 Shape = NeuralSurface | Mesh
 
@@ -40,8 +39,10 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
     """The surface that a user names.
 
     Args:
-        given: a NeuralSurface; the folder of one; a mesh file; a name of the catalogue; or an
-            analytic surface, as ``{"name": ..., parameters}`` or, for a target, by its name.
+        given: a NeuralSurface; the folder of one; a mesh file; a name of the catalogue; an object
+            of trimesh; arrays (V, 3), (F, 3); a prepared Surface, which is prepared again for the
+            map; or an analytic surface, as ``{"name": ..., parameters}`` or, for a target, by its
+            name.
         domain: on which the surface has to lie.
         key: the setting's name, for messages.
         trust: modules whose classes a run folder may name, beside those of nsm and torch.
@@ -57,26 +58,29 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
         )
     if isinstance(given, dict):
         return analytic_surface(given, domain)
-    if not isinstance(given, (NeuralSurface, str, Path)):
-        raise NsmError(
-            f"setting {key}: a {type(given).__name__} is no surface; give a neural surface, a mesh "
-            "file, a catalogue name or a run folder",
-            kind="wrong_type",
-            key=key,
-        )
+    if isinstance(given, Surface):
+        if given.raw is None:
+            raise NsmError(
+                f"{key}={given.name}: a surface of a run folder has no mesh to prepare again; give "
+                "its neural surface or the mesh file",
+                kind="wrong_type",
+                key=key,
+            )
+        return Mesh(given.name, *given.raw)
     if isinstance(given, NeuralSurface):
         ready = given
+    elif not isinstance(given, (str, Path)):
+        mesh = given_mesh(given, key)
+        return Mesh(mesh.name, mesh.vertices, mesh.faces, mesh.log)
     else:
         name = str(given)
         if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
             ready = load_surface(name, trust=trust)
         elif key == "target" and _is_analytic(name, domain):
             return analytic_surface({"name": name}, domain)
-        elif Path(name).suffix or os.sep in name or Path(name).exists():
-            vertices, faces, log = load_mesh(name)
-            return Mesh(Path(name).stem, vertices, faces, tuple(log))
         else:
-            return Mesh(name, *catalogue_mesh(name))
+            mesh = given_mesh(name)
+            return Mesh(mesh.name, mesh.vertices, mesh.faces, mesh.log)
     if ready.surface.domain != domain:
         raise NsmError(
             f"{key}={ready.surface.name}: it lies on the {ready.surface.domain}, but domain="

@@ -61,13 +61,16 @@ _HARDWARE = (
 )
 
 
-def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
+def neural_surface(config: DictConfig, console: Console, given: Any = None) -> NeuralSurface:
     """The neural surface that a map's configuration names, made if it is not there yet.
+
+    Args:
+        given: in its place, a mesh as :meth:`Surface.load` takes it, or a prepared surface.
 
     Raises:
         NsmError: a mesh, neural surface or setting that cannot be used.
     """
-    if config.phi.path is not None:
+    if given is None and config.phi.path is not None:
         phi = load_surface(config.phi.path, trust=config.trust)
         if phi.surface.domain != domain(config.domain):
             raise NsmError(
@@ -77,7 +80,7 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
                 key="phi.path",
             )
         return phi
-    surface = configured_surface(config, console)
+    surface = configured_surface(config, console, given)
     report_surface(console, surface)
     return cached_surfaces([surface], config, console)[0]
 
