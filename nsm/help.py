@@ -213,6 +213,8 @@ _USAGE = """\
 Neural surface maps: meshes as networks, and maps between them.
 
   nsm MESH [GROUP=OPTION ...] [SETTING=VALUE ...]   run
+  nsm pair_map MESH MESH [landmarks=FILE] ...    the same for two surfaces, or for another task
+  nsm ... device=cuda                            on the GPU, or device=cpu
   nsm -m GROUP=OPTION,OPTION ...                 run all combinations: a sweep
   nsm -m sweep=NAME ...                          one of the sweeps below
   nsm resume=FOLDER                              continue an interrupted run

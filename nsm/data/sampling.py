@@ -65,9 +65,7 @@ class SurfaceSampler:
         generator.manual_seed((seed * 1_000_003 + step) % (2**63))
         return generator
 
-    def by_area(
-        self, count: int, generator: torch.Generator, stratified: bool = False
-    ) -> Samples:
+    def by_area(self, count: int, generator: torch.Generator, stratified: bool = False) -> Samples:
         """``count`` points, uniform by area of the mesh.
 
         Stratified, one lies in each of ``count`` parts of equal area, so that sums over them vary

@@ -17,6 +17,7 @@ from nsm.domains.names import stored as stored_domain
 from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
+from nsm.stages import counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.validation import CleanMesh, clean
@@ -77,7 +78,7 @@ def prepare_jointly(
                 cache=cache,
                 log=m.log,
             )
-            for m in meshes
+            for m in counted("layout on the domain", meshes)
         ]
     digest = hashlib.sha256()
     for c, ids in zip(cleaned, found, strict=True):
@@ -194,7 +195,10 @@ def _cut_and_embed(
             keys=Keys(key, fractions),
             log=(*m.log, *c.log, line),
         )
-        for m, c, cut, key in zip(meshes, cleaned, best.cuts, best.keys, strict=True)
+        for m, c, cut, key in counted(
+            "layout on the domain",
+            list(zip(meshes, cleaned, best.cuts, best.keys, strict=True)),
+        )
     ]
 
 

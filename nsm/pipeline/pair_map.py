@@ -14,7 +14,7 @@ from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
-from nsm.maps import AnalyticSurface, Remembered, Tabulated, LatticeAligned, Rotated
+from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.proposed_landmarks import AUTO, ProposedLandmarks, propose_landmarks
 from nsm.pipeline.resolve_inputs import (

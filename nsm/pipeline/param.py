@@ -40,7 +40,10 @@ class ParamTask(Task):
         return [] if ready is None else [ready]
 
     def prepare(self, given: Given) -> None:
-        self.use(neural_surface(self.config, self.console) if given.phi is None else given.phi)
+        phi = given.phi
+        if not isinstance(phi, NeuralSurface):
+            phi = neural_surface(self.config, self.console, phi)
+        self.use(phi)
 
     def use(self, phi: NeuralSurface) -> None:
         """Take the neural surface."""

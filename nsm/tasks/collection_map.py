@@ -79,7 +79,9 @@ class CollectionMap(ConstrainedMap):
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
         held = self.constraints
-        self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every) for _ in phis)
+        self.fold_barrier = nn.ModuleList(
+            FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every) for _ in phis
+        )
         start = torch.stack([h.before(points) for h in self.map])  # type: ignore[operator]
         self.set_landmarks(points, targets, start, seam)
         self.diagonals = diagonals

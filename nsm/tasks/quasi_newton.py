@@ -59,9 +59,7 @@ class QuasiNewton(Optimizer):
         if len(steps) != len(levels) - 1 or min(steps, default=0) < 0:
             raise ValueError("optimizer.steps has one number, 0 or more, per level but the last")
         if min(iterations, memory) < 1 or not (first_step > 0 and lr > 0):
-            raise ValueError(
-                "optimizer.iterations, memory, first_step and lr must be above 0"
-            )
+            raise ValueError("optimizer.iterations, memory, first_step and lr must be above 0")
         super().__init__(params, {"lr": lr})
         held = [p for group in self.param_groups for p in group["params"]]
         if {id(p) for p in held} != {id(f.coefficients) for f in fields}:
