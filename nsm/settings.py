@@ -254,15 +254,16 @@ class ProposalSettings:
 
 @dataclass
 class SeamSettings:
-    """How closed meshes with landmarks are cut jointly.
+    """How closed meshes with landmarks are cut.
 
     Args:
-        path: shortest or hidden paths; auto: the ones for which the domains agree best.
+        path: shortest or hidden paths; auto: the ones for which the domains agree best; own: each
+            mesh is cut by itself, without regard to the landmarks.
         landmarks: how many landmarks the cut passes through, mutually distant ones; null: the
             number for which the domains agree best.
     """
 
-    path: Literal["auto", "shortest", "hidden"] = "auto"
+    path: Literal["auto", "shortest", "hidden", "own"] = "auto"
     landmarks: Whole | None = None
 
 
@@ -294,6 +295,8 @@ class TrainerSettings:
             core or GPU.
         stop_gradient_norm: stop when the norm of the gradient, averaged over ``stop_window``
             steps, falls below this; null: never.
+        stop_norm_of: the loss whose norm is meant: mean over the batch, as it is trained; or sum,
+            the mean's times ``data.batch_size``.
         stop_window: steps over which the norm is averaged.
         threads: of the CPU; the default networks are so small that one is fastest. null: what
             torch chooses, for large networks.
@@ -313,6 +316,7 @@ class TrainerSettings:
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: Count = 1
     stop_gradient_norm: Weight | None = None
+    stop_norm_of: Literal["mean", "sum"] = "mean"
     stop_window: Count = 100
     threads: Count | None = 1
     precision: Literal["float32", "tf32", "bf16"] = "float32"
