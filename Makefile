@@ -7,6 +7,7 @@ BIN := .venv/bin
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
+	@echo "now: . .venv/bin/activate, and then nsm mine.obj; or .venv/bin/nsm mine.obj"
 
 test: check
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2

@@ -36,7 +36,7 @@ VARIANTS = {
     "surfaces from a random start": [
         'phi.overrides=["initialization=random","encoding.resolutions=[16,64,256]"]'
     ],
-    "paper, as many steps": ["experiment=paper_pair", "trainer.max_steps=1500"],
+    "paper, as many steps": ["experiment=paper", "trainer.max_steps=1500"],
 }
 SEAMS = {
     "auto": [],

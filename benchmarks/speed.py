@@ -82,12 +82,10 @@ def dome(rings: int = 30, height: float = 0.5) -> Surface:
 
 
 def config_of(task: str, settings: str) -> DictConfig:
-    """The task's configuration; the paper's for maps is that of its pair maps."""
+    """The task's configuration."""
     overrides = [f"task={task}", "seed=0"]
     if settings == "paper":
-        overrides += ["experiment=paper" if task == "overfit" else "experiment=paper_pair"]
-        if task == "param":
-            overrides += ["constraints=param", "loss_weights.triangles=0"]
+        overrides += ["experiment=paper"]
     return compose_config(overrides)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import random
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ _HOME = {
     "register_encoding": "nsm.extensions",
     "register_energy": "nsm.extensions",
 }
+__version__ = version("nsm")
+
 # what extensions are written with: ``nsm.energies``, ``nsm.data``, ...
 _PACKAGES = ("data", "domains", "energies", "maps", "results", "surfaces", "tasks")
 
@@ -84,5 +87,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    hidden = {"Any", "TYPE_CHECKING", "annotations", "import_module", "random"}
-    return sorted({*globals(), *__all__, *_PACKAGES} - hidden)
+    return sorted([*__all__, *_PACKAGES, "__version__"])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from nsm.command_line import prepared_overrides
 from nsm.config import compose_config, conf_folder, dotted, unknown_setting
 from nsm.domains import Surface
 from nsm.errors import NsmError, of_disk
@@ -34,7 +35,7 @@ from nsm.sweeps import is_complete
 
 
 def overfit(
-    surface: Surface,
+    surface: Any,
     *,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
@@ -44,10 +45,11 @@ def overfit(
     """Train a network to reproduce a surface.
 
     Args:
-        surface: the prepared surface.
+        surface: a prepared surface; or a mesh: a file, a name of the catalogue, an object of
+            trimesh, or a pair of arrays (V, 3), (F, 3).
         overrides: settings as on the command line, e.g. ``["trainer.max_steps=1000"]``.
         folder: where to leave the run's files; without it they are not kept.
-        progress: show a progress bar.
+        progress: show what goes on, and the figures at the end; without it nothing is printed.
         **settings: settings by name: a string chooses the option of a group, a dictionary sets
             the settings within, a class is what ``_target_`` names:
             ``activation="silu", trainer={"max_steps": 1000}, seed=1``.
@@ -62,14 +64,14 @@ def overfit(
         >>> phi = nsm.overfit(nsm.Surface.load("terrain"), experiment="quick")
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
-    _expect(surface, Surface)
-    request = _Request("overfit", overrides, settings, [surface])
+    ready = [surface] if isinstance(surface, Surface) else []
+    request = _Request("overfit", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
-        return run_task(config, place, given=Given(surface=surface))
+        return run_task(config, place, given=Given(surface=surface), quiet=not progress)
 
 
 def parameterize(
-    phi: NeuralSurface,
+    phi: Any,
     *,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
@@ -79,7 +81,7 @@ def parameterize(
     """Flatten a neural surface to the plane with least distortion and a free boundary.
 
     Args:
-        phi: the neural surface.
+        phi: a neural surface; or a surface or mesh as for :func:`overfit`, of which one is made.
         overrides, folder, progress, **settings: as for :func:`overfit`, e.g.
             ``energy="conformal"``.
 
@@ -94,15 +96,15 @@ def parameterize(
         >>> flat = nsm.parameterize(phi)
         >>> flat.uv  # (V, 2), of the cut mesh's vertices
     """
-    _expect(phi, NeuralSurface)
-    request = _Request("param", overrides, settings, [phi.surface])
+    given = phi.surface if isinstance(phi, NeuralSurface) else phi
+    request = _Request("param", overrides, settings, [given] if isinstance(given, Surface) else [])
     with request.run(folder, progress) as (config, place):
-        return run_task(config, place, given=Given(phi=phi))
+        return run_task(config, place, given=Given(phi=phi), quiet=not progress)
 
 
 def map_pair(
-    source: NeuralSurface | str | Path,
-    target: NeuralSurface | str | Path | dict[str, Any],
+    source: Any,
+    target: Any,
     landmarks: Any = None,
     *,
     overrides: Sequence[str] = (),
@@ -116,11 +118,13 @@ def map_pair(
     which gives the best maps; neural surfaces are taken as they are.
 
     Args:
-        source: a neural surface, the folder of one, a mesh file, or a name of the catalogue.
+        source: a neural surface, the folder of one, a mesh file, a name of the catalogue, an
+            object of trimesh, a pair of arrays (V, 3), (F, 3), or a Surface, whose mesh is prepared
+            again for the map.
         target: the same; or an analytic surface, by name or as ``{"name": ..., parameters}``.
-        landmarks: pairs ``[(i, j), ...]`` of vertices of the two mesh files, or of points (x, y,
-            z), in lists, an array or a tensor; or a JSON file of them; or two files, one for each
-            surface.
+        landmarks: pairs ``[(i, j), ...]`` of vertices of the two meshes as given, counted from
+            0 (of an OBJ file its ``v`` lines), or of points (x, y, z), in lists, an array or a
+            tensor; or a JSON file of them; or two files, one for each surface.
         overrides, folder, progress, **settings: as for :func:`overfit`, e.g. ``energy="arap"``.
 
     Returns:
@@ -133,15 +137,15 @@ def map_pair(
         >>> f = nsm.map_pair("cat.obj", "horse.obj", landmarks=[(5259, 2289), (3651, 5255)])
         >>> f(points)  # (N, 3) on the cat to (N, 3) on the horse
     """
-    ready = [end.surface for end in (source, target) if isinstance(end, NeuralSurface)]
+    ready = _prepared((source, target))
     request = _Request("pair_map", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
         given = Given(source=source, target=target, landmarks=landmarks)
-        return run_task(config, place, given=given)
+        return run_task(config, place, given=given, quiet=not progress)
 
 
 def map_collection(
-    surfaces: Sequence[NeuralSurface | str | Path],
+    surfaces: Sequence[Any],
     landmarks: Any = None,
     *,
     overrides: Sequence[str] = (),
@@ -168,10 +172,17 @@ def map_collection(
     """
     if not isinstance(surfaces, Sequence) or isinstance(surfaces, str):
         raise NsmError("surfaces: give a list of them", kind="wrong_type", key="surfaces")
-    ready = [phi.surface for phi in surfaces if isinstance(phi, NeuralSurface)]
+    ready = _prepared(surfaces)
     request = _Request("collection_map", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
-        return run_task(config, place, given=Given(surfaces=surfaces, landmarks=landmarks))
+        given = Given(surfaces=surfaces, landmarks=landmarks)
+        return run_task(config, place, given=given, quiet=not progress)
+
+
+def _prepared(given: Sequence[Any]) -> list[Surface]:
+    """The prepared surfaces among those given."""
+    surfaces = [one.surface if isinstance(one, NeuralSurface) else one for one in given]
+    return [surface for surface in surfaces if isinstance(surface, Surface)]
 
 
 # what the function that is called, and its arguments, say
@@ -204,6 +215,10 @@ class _Request:
                 kind="wrong_type",
                 key="overrides",
             )
+        settings = dict(settings)
+        if "device" in settings:
+            overrides = [*overrides, f"device={settings.pop('device')}"]
+        overrides = prepared_overrides(overrides)
         known = {key.partition(".")[0] for key in known_keys()}
         chosen, merged = [], {}
         for setting in dotted(settings):
@@ -307,11 +322,6 @@ def _plain(key: str, value: Any) -> Any:
 def _name(target: Any) -> Any:
     """The ``_target_`` of a class or function; a name as it is."""
     return target_of(target) if callable(target) else target
-
-
-def _expect(given: Any, kind: type) -> None:
-    if not isinstance(given, kind):
-        raise NsmError(f"give a {kind.__name__}, not a {type(given).__name__}", kind="wrong_type")
 
 
 def load(

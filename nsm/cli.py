@@ -18,17 +18,37 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
 
 from nsm.arguments import Arguments
-from nsm.config import conf_folder, prepared_overrides, register, setting_error
+from nsm.command_line import prepared_overrides, with_task
+from nsm.config import conf_folder, register, setting_error
 from nsm.errors import NsmError, of_disk
 from nsm.plugins import import_here, import_plugins
 from nsm.run_directories import remove_empty
+from nsm.stages import stage
 from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
 # input. Imported only when called for.
-COMMANDS: dict[str, str] = {"report": "nsm.commands.report", "view": "nsm.commands.view"}
+COMMANDS: dict[str, str] = {
+    "landmarks": "nsm.commands.landmarks",
+    "report": "nsm.commands.report",
+    "view": "nsm.commands.view",
+}
+BRIEF = """\
+nsm: neural surface maps
+
+  nsm mine.obj                       a neural surface of a mesh
+  nsm pair_map a.obj b.obj           a map between two surfaces
+  nsm collection_map a b c           maps among three or more
+  nsm param mine.obj                 flatten
+  nsm landmarks a.obj b.obj          place landmarks in the browser
+  nsm view FOLDER                    show a run in the browser
+  nsm report FOLDER...               compare runs
+
+A mesh is an OBJ, PLY, OFF, STL, GLTF or GLB file, or a model of the catalogue: nsm --help surface.
+Add settings, as in device=cuda experiment=quick; nsm --help lists them."""
 # Hydra's documented flags, and whether each has a value
 _HYDRA_FLAGS: dict[tuple[str, ...], dict[str, Any]] = {
     ("--hydra-help",): {"action": "store_true"},
@@ -70,7 +90,9 @@ def main() -> None:
 
 
 def _main(arguments: list[str]) -> int:
-    if arguments and arguments[0] in COMMANDS:
+    if not arguments:
+        print(BRIEF)
+    elif arguments[0] in COMMANDS:
         importlib.import_module(COMMANDS[arguments[0]]).main(arguments[1:])
     elif {"--help", "-h"} & set(arguments):
         from nsm.help import main
@@ -116,7 +138,7 @@ def _hydra_arguments(arguments: Sequence[str]) -> list[str]:
         flags += [name] if value is True else [name, value] if value else []
     if given.shell_completion:  # its overrides are query=bash, install=bash
         return [*flags, *given.overrides]
-    return [*flags, *prepared_overrides(given.overrides)]
+    return [*flags, *prepared_overrides(with_task(given.overrides))]
 
 
 def _run_tasks(arguments: list[str]) -> int:
@@ -162,12 +184,13 @@ def _run(config: DictConfig) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
-        from nsm.config_validation import checked
+        with stage(Console(highlight=False, markup=False), "loading libraries"):
+            from nsm.config_validation import checked
 
-        complete = checked(config, overrides)
-        if complete.resume is not None:
-            _check_alone(str(complete.resume), overrides)
-        from nsm.pipeline import run
+            complete = checked(config, overrides)
+            if complete.resume is not None:
+                _check_alone(str(complete.resume), overrides)
+            from nsm.pipeline import run
 
         run(complete, folder)
     finally:

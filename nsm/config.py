@@ -15,14 +15,13 @@ import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from nsm.command_line import prepared_overrides
 from nsm.errors import NsmError
-from nsm.migration import check_override, migrated
+from nsm.migration import migrated
 from nsm.settings import Settings, conf_folder
 from nsm.sweeps import sweep_folder
 
@@ -36,8 +35,6 @@ _WEIGHTS = ("loss_weights", "constraints")
 
 _LARGEST_CONFIG = 1_000_000  # bytes
 _LONGEST_NAME = 100  # of a run folder, without its time; file systems take 255 bytes
-# settings that are files or folders: signs that Hydra's grammar reserves are quoted for the user
-_PATHS = ("surface.path", "phi.path", "source", "target", "landmarks", "resume", "hydra.run.dir")
 
 
 def register() -> None:
@@ -102,6 +99,7 @@ def compose_config(
     """
     from nsm.config_validation import checked  # which imports torch
 
+    overrides = prepared_overrides(overrides)
     config, _ = composed(overrides)
     if settings:
         OmegaConf.set_struct(config, False)
@@ -146,43 +144,6 @@ def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield from dotted(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}={value}"
-
-
-def prepared_overrides(overrides: Sequence[str]) -> list[str]:
-    """Overrides with mesh files, and paths with special signs, in the form that Hydra takes.
-
-    ``mesh.obj`` and ``surface=mesh.obj`` become ``surface.path="mesh.obj"``.
-
-    Raises:
-        NsmError: an override whose setting has another name now.
-    """
-    prepared = []
-    for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals and _is_file(override):
-            key, value = "surface.path", override
-        check_override(key, value)
-        if key == "surface" and all(map(_is_file, value.strip("'\"").split(","))):
-            key = "surface.path"
-        if key.lstrip("+") in _PATHS and not _readable(f"{key}={value}"):
-            value = QuotedString(value, Quote.double).with_quotes()
-        prepared.append(f"{key}={value}" if equals or key == "surface.path" else override)
-    return prepared
-
-
-def _is_file(value: str) -> bool:
-    from nsm.surfaces.loading import EXTENSIONS
-
-    known = (conf_folder() / "surface" / f"{value}.yaml").is_file()
-    return not known and ("/" in value or "\\" in value or Path(value).suffix.lower() in EXTENSIONS)
-
-
-def _readable(override: str) -> bool:
-    try:
-        OverridesParser.create().parse_override(override)
-    except HydraException:
-        return False
-    return True
 
 
 def read_config(file: Path) -> DictConfig:

@@ -213,11 +213,14 @@ _USAGE = """\
 Neural surface maps: meshes as networks, and maps between them.
 
   nsm MESH [GROUP=OPTION ...] [SETTING=VALUE ...]   run
+  nsm pair_map MESH MESH [landmarks=FILE] ...    the same for two surfaces, or for another task
+  nsm ... device=cuda                            on the GPU, or device=cpu
   nsm -m GROUP=OPTION,OPTION ...                 run all combinations: a sweep
   nsm -m sweep=NAME ...                          one of the sweeps below
   nsm resume=FOLDER                              continue an interrupted run
   nsm report FOLDER...                           compare runs on one page
   nsm view FOLDER                                show a run's shapes in the browser
+  nsm landmarks MESH MESH...                     place landmarks in the browser
   nsm --help NAME [...]                          about a group or a setting
   nsm --cfg job [...]                            print the settings, without a run
   nsm --debug [...]                              with tracebacks of errors"""

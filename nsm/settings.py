@@ -254,15 +254,16 @@ class ProposalSettings:
 
 @dataclass
 class SeamSettings:
-    """How closed meshes with landmarks are cut jointly.
+    """How closed meshes with landmarks are cut.
 
     Args:
-        path: shortest or hidden paths; auto: the ones for which the domains agree best.
+        path: shortest or hidden paths; auto: the ones for which the domains agree best; own: each
+            mesh is cut by itself, without regard to the landmarks.
         landmarks: how many landmarks the cut passes through, mutually distant ones; null: the
             number for which the domains agree best.
     """
 
-    path: Literal["auto", "shortest", "hidden"] = "auto"
+    path: Literal["auto", "shortest", "hidden", "own"] = "auto"
     landmarks: Whole | None = None
 
 
@@ -294,6 +295,8 @@ class TrainerSettings:
             core or GPU.
         stop_gradient_norm: stop when the norm of the gradient, averaged over ``stop_window``
             steps, falls below this; null: never.
+        stop_norm_of: the loss whose norm is meant: mean over the batch, as it is trained; or sum,
+            the mean's times ``data.batch_size``.
         stop_window: steps over which the norm is averaged.
         threads: of the CPU; the default networks are so small that one is fastest. null: what
             torch chooses, for large networks.
@@ -313,6 +316,7 @@ class TrainerSettings:
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: Count = 1
     stop_gradient_norm: Weight | None = None
+    stop_norm_of: Literal["mean", "sum"] = "mean"
     stop_window: Count = 100
     threads: Count | None = 1
     precision: Literal["float32", "tf32", "bf16"] = "float32"
@@ -419,6 +423,10 @@ class Settings:
             task=pair_map with two closed meshes of genus 0: landmarks are proposed.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
+        texture: of task=pair_map: an image for the source's texture coordinates; or own: the
+            materials of its file. It is baked to the target, as target_textured.obj and .glb; the
+            target's own texture, if it has one, to the source.
+        texture_size: texels a side of the baked images.
         loss_terms: your own terms: +loss_terms.mine._target_=mypackage.MyTerm
             +loss_terms.mine.weight=0.1.
         callbacks: Lightning callbacks: +callbacks.mine._target_=mypackage.MyCallback.
@@ -435,6 +443,8 @@ class Settings:
     target: str | dict[str, Any] | None = None
     surfaces: list[Any] | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
+    texture: str | None = None
+    texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)
     proposal: ProposalSettings = field(default_factory=ProposalSettings)
     isotopy_class: Whole = 0

@@ -21,7 +21,7 @@ ROOMS = [
     "pipeline",
 ]
 # what every room may import
-COMMON = {"errors", "instantiation", "optional_dependencies", "settings"}
+COMMON = {"errors", "instantiation", "optional_dependencies", "settings", "stages"}
 # rooms that stand for themselves: meshes in numpy, and maps in torch
 INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}
 # a run knows its configuration, its folder, the sweep that it belongs to and the user's modules;

@@ -30,7 +30,9 @@ from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, BLOCKS, NeuralMap, as_activation, build_analytic
 from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
+from nsm.results.textured_mesh import TexturedMesh
 from nsm.surfaces import catalogue_names
+from nsm.surfaces.location import Places
 
 NEURAL, FLAT, PAIR, TRIO = results(rings=3)
 VERTICES = len(NEURAL[0].surface.vertices)
@@ -85,6 +87,61 @@ def test_functions_of_space(array):
     check_points(PAIR, array, 3, (3,))
     check_points(PAIR.aligned, array, 3, (3,))
     check_points(NEURAL[0].in_original_units, array, 3, (3,))
+
+
+@pytest.fixture(scope="module")
+def painted_files(tmp_path_factory) -> Path:
+    """The domes 0 and 1 as OBJ files: the first with texture coordinates and an image."""
+    folder = tmp_path_factory.mktemp("painted")
+    for k in (0, 1):
+        s = NEURAL[k].surface
+        vertices = NEURAL[k].in_original_units(s.vertices)
+        faces, image = s.faces, np.full((8, 8, 3), 100, np.uint8)
+        mesh = TexturedMesh(vertices, faces, (0.5 + 0.4 * s.uv)[faces], image)
+        mesh.export(folder / f"{k}.obj")
+    (folder / "1.mtl").unlink()
+    return folder
+
+
+@examples(25)
+@given(
+    *[st.sampled_from(["0.obj", "1.obj", "0.png", "none.obj", "sphere", ""])] * 2,
+    st.none() | st.sampled_from(["0.png", "0.obj", "none.png"]),
+    st.booleans(),
+    st.integers(-1, 9) | st.sampled_from([2**40, True, 1.5, None]),
+)
+def test_what_is_baked(painted_files, source, target, texture, back, size):
+    ends = [painted_files / name if "." in name else name for name in (source, target)]
+    image = None if texture is None else painted_files / texture
+    try:
+        mesh = PAIR.bake(*ends, texture=image, back=back, size=size)
+    except NsmError as error:
+        good = texture == "0.png" or texture is None and not back
+        fits = isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= 8192
+        assert "\n" not in str(error)
+        assert not (good and fits and (source, target) == ("0.obj", "1.obj"))
+        return
+    assert mesh.image.shape == (size, size, 3) and (mesh.image == 100).all()
+    assert len(mesh.uv) == len(mesh.faces)
+
+
+@examples(20)
+@given(st.integers(0, 10**6), st.booleans())
+def test_places_are_those_of_points(seed, back):
+    random = np.random.default_rng(seed)
+    s, t = PAIR.source.surface, PAIR.target.surface
+    start, end = (t, s) if back else (s, t)
+    given_ = Places(random.integers(0, len(start.faces), 20), random.dirichlet(np.ones(3), 20))
+    found = PAIR.places(given_, back=back)
+    again = PAIR.places(found, back=not back)
+    assert np.allclose(found.weights.sum(axis=1), 1) and (found.weights >= 0).all()
+    there, here = (p.take(start.uv, start.faces) for p in (again, given_))
+    inner = np.linalg.norm(here, axis=1) < 0.8  # the rim's polygons differ by their arcs
+    assert np.allclose(there[inner], here[inner], atol=1e-9)
+    if not back:
+        points = PAIR.source.in_original_units(given_.take(s.vertices, s.faces))
+        images = PAIR.target.in_original_units(found.take(end.vertices, end.faces))
+        assert np.allclose(PAIR(points), images, atol=1e-9)
 
 
 @examples(30)
@@ -605,6 +662,8 @@ PROPERTIES: dict[str, list[Callable]] = {
         test_functions_of_the_domain,
         test_points_keep_to_the_target_and_units_come_back,
     ],
+    "SurfaceMap.bake": [test_what_is_baked],
+    "SurfaceMap.places": [test_places_are_those_of_points],
     "SurfaceMap.transfer": [test_transfer],
     "SurfaceMap.morph": [test_morph],
     "SurfaceMap.aligned": [test_functions_of_space],

@@ -19,6 +19,7 @@ from nsm.domains.common_seams import (
 )
 from nsm.domains.disc import Disc
 from nsm.errors import NsmError
+from nsm.stages import at
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import Cut, cut_along_paths
 from nsm.surfaces.geometry import triangle_distortion
@@ -70,11 +71,13 @@ def best_common_cut(
             if seam_landmarks
             else sorted({max(2, round(share * total)) for share in _SHARES})
         )
-        tried = [
-            (_disagreement(way, landmarks), k, way)
-            for k, (path, count) in enumerate(itertools.product(SEAMS, counts))
-            if (way := _common_cut(names, cleaned, landmarks, path, costs[path], count)) is not None
-        ]
+        ways = list(itertools.product(SEAMS, counts))
+        tried = []
+        for k, (path, count) in enumerate(ways):
+            at("trying seams", k, len(ways))
+            way = _common_cut(names, cleaned, landmarks, path, costs[path], count)
+            if way is not None:
+                tried.append((_disagreement(way, landmarks), k, way))
         best = min(tried, default=(0.0, 0, None))[2]
     else:
         best = _common_cut(names, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
@@ -175,7 +178,8 @@ def common_fractions(
     over the discs. The keys nearest to the domain's corners become the corners.
     """
     gaps = []
-    for cut, key in zip(_of_disc_area(cuts), keys, strict=True):
+    for k, (cut, key) in enumerate(zip(_of_disc_area(cuts), keys, strict=True)):
+        at("places on the boundary", k, len(cuts))
         uv = _DISC.embed(cut.vertices, cut.faces, keys=Keys(key[:1], np.zeros(1))).uv[key]
         angle = np.arctan2(uv[:, 1], uv[:, 0]) / (2 * np.pi)
         gaps.append((np.roll(angle, -1) - angle) % 1.0)

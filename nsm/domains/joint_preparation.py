@@ -17,6 +17,7 @@ from nsm.domains.names import stored as stored_domain
 from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
+from nsm.stages import counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.validation import CleanMesh, clean
@@ -54,7 +55,8 @@ def prepare_jointly(
         landmarks: (L,) vertices of each, in the same order.
         domain, parameterization, cache: as for :meth:`Surface.load`.
         seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
-            ``auto``, which tries both and keeps the seam for which the domains agree best.
+            ``auto``, which tries both and keeps the seam for which the domains agree best; or
+            ``own``: each mesh is cut by itself.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
             all of them, or, with ``auto``, the number for which the domains agree best.
 
@@ -66,7 +68,8 @@ def prepare_jointly(
     cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
     enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
-    if _common_topology(meshes, cleaned) != (0, 0) or not enough:
+    apart = seam == "own" and domain.has_boundary
+    if _common_topology(meshes, cleaned) != (0, 0) or not enough or apart:
         return [
             Surface.from_arrays(
                 m.vertices,
@@ -77,7 +80,7 @@ def prepare_jointly(
                 cache=cache,
                 log=m.log,
             )
-            for m in meshes
+            for m in counted("layout on the domain", meshes)
         ]
     digest = hashlib.sha256()
     for c, ids in zip(cleaned, found, strict=True):
@@ -194,7 +197,10 @@ def _cut_and_embed(
             keys=Keys(key, fractions),
             log=(*m.log, *c.log, line),
         )
-        for m, c, cut, key in zip(meshes, cleaned, best.cuts, best.keys, strict=True)
+        for m, c, cut, key in counted(
+            "layout on the domain",
+            list(zip(meshes, cleaned, best.cuts, best.keys, strict=True)),
+        )
     ]
 
 

@@ -6,8 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,10 @@ from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangl
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
-from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies, seam_pairs
+from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import listed
-from nsm.surfaces.loading import as_arrays, load_mesh
+from nsm.surfaces.loading import as_arrays
 from nsm.surfaces.validation import CleanMesh, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
@@ -53,6 +52,8 @@ class Surface:
         log: repairs, conversions and cuts, a line each.
         lattice: (2, 2) on a closed domain: the surface is least distorted in the plane of
             (lattice / 2) uv, where it has the area of Ω. None elsewhere.
+        raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
+            a surface of a run folder.
     """
 
     name: str
@@ -68,11 +69,12 @@ class Surface:
     quality: dict[str, float] = field(default_factory=dict, repr=False)
     log: tuple[str, ...] = field(default=(), repr=False)
     lattice: np.ndarray | None = field(default=None, repr=False)
+    raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @classmethod
     def load(
         cls,
-        path_or_name: str | Path,
+        path_or_name: Any,
         *,
         domain: str | Domain = "disc",
         seam_vertices: Sequence[int] | None = None,
@@ -83,7 +85,8 @@ class Surface:
         """Load a mesh file, or a mesh of the catalogue by name, and prepare it.
 
         Args:
-            path_or_name: an OBJ, PLY, OFF, STL, GLTF or GLB file, or a catalogue name.
+            path_or_name: an OBJ, PLY, OFF, STL, GLTF or GLB file, or a catalogue name; also an
+                object of trimesh, or a pair of arrays (V, 3), (F, 3).
             domain: Ω, or the name of one of :data:`nsm.domains.DOMAINS`.
             seam_vertices: vertices (numbers in the file) that the seam passes through; by default
                 mutually far ones where a seam is needed.
@@ -96,30 +99,17 @@ class Surface:
         Raises:
             NsmError: no such file or name, or a mesh that cannot be prepared.
         """
-        if not isinstance(path_or_name, (str, Path)):
-            kind = type(path_or_name).__name__
-            raise NsmError(
-                f"a {kind} is no mesh file; give its path, or the arrays to Surface.from_arrays",
-                kind="wrong_type",
-                key="path_or_name",
-            )
-        text = str(path_or_name)
-        if Path(text).suffix or "/" in text or "\\" in text or Path(text).exists():
-            vertices, faces, log = load_mesh(path_or_name)
-            name = Path(text).stem
-        else:
-            vertices, faces = catalogue_mesh(text)
-            name, log = text, ()
+        mesh = given_mesh(path_or_name, "path_or_name")
         return cls.from_arrays(
-            vertices,
-            faces,
-            name=name,
+            mesh.vertices,
+            mesh.faces,
+            name="mesh" if mesh.name == "path_or_name" else mesh.name,
             domain=domain,
             seam_vertices=seam_vertices,
             cones=cones,
             parameterization=parameterization,
             cache=cache,
-            log=log,
+            log=mesh.log,
         )
 
     @classmethod
@@ -167,8 +157,9 @@ class Surface:
             options["cones"] = corners
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
+        raw = (vertices, faces)
         if stored is not None:
-            return cls.from_stored(name, domain, stored)
+            return replace(cls.from_stored(name, domain, stored), raw=raw)
         mesh = clean(vertices, faces, name)
         about: dict[str, Any] = {
             "name": name,
@@ -187,7 +178,7 @@ class Surface:
             surface = cls.from_closed(mesh, cones=corners, **about)
         if cache:
             cache_.write(key, surface.to_stored())
-        return surface
+        return replace(surface, raw=raw)
 
     @classmethod
     def from_cut(
@@ -314,13 +305,14 @@ class Surface:
     def from_stored(cls, name: str, domain: str | Domain, stored: dict[str, np.ndarray]) -> Surface:
         """The surface of arrays that :meth:`to_stored` gave."""
         details: dict[str, Any] = json.loads(stored["words"].tobytes())
+        arrays: dict[str, Any] = {n: stored[n] for n in (*ARRAYS, *OPTIONAL) if n in stored}
         return cls(
             name=name,
             domain=domain_of(domain),
             scale=details["scale"],
             quality=details["quality"],
             log=(*details["log"], "prepared surface taken from the cache"),
-            **{name: stored[name] for name in (*ARRAYS, *OPTIONAL) if name in stored},
+            **arrays,
         )
 
     def arrays(self) -> dict[str, np.ndarray]:

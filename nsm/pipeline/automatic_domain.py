@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,7 @@ from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, build_analytic
 from nsm.results import NeuralSurface, load_surface
-from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.given import given_mesh
 from nsm.surfaces.topology import genus_and_boundary
 from nsm.surfaces.validation import clean
 
@@ -36,7 +34,7 @@ def choose_domain(
 
     Args:
         config: of the run; ``domain`` is replaced.
-        inputs: ready surfaces, mesh files, names and analytic surfaces, as
+        inputs: ready surfaces, meshes and analytic surfaces, as
             :func:`nsm.pipeline.resolve_inputs.read_shape` takes them.
         console: where the choice is told.
         closed: whether the task can do without a boundary.
@@ -67,18 +65,15 @@ def _told_by(given: Any, config: DictConfig) -> tuple[Domain | None, tuple[int, 
         return given.domain, None
     if isinstance(given, dict):
         return _analytic(given), None
-    if not isinstance(given, (str, Path)):
-        return None, None  # an input that is refused where it is read
-    name = str(given)
-    if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
+    if given is None:
+        return None, None  # refused where it is read
+    name = str(given) if isinstance(given, (str, Path)) else ""
+    if name and ((Path(name) / "surface.json").exists() or name.endswith("surface.safetensors")):
         return load_surface(name, trust=config.trust).surface.domain, None
     if name in ANALYTIC and name == str(config.get("target")):
         return _analytic({"name": name}), None
-    if Path(name).suffix or os.sep in name or Path(name).exists():
-        vertices, faces, _ = load_mesh(name)
-    else:
-        vertices, faces = catalogue_mesh(name)
-    return None, genus_and_boundary(clean(vertices, faces, Path(name).stem).faces)
+    mesh = given_mesh(given)
+    return None, genus_and_boundary(clean(mesh.vertices, mesh.faces, mesh.name).faces)
 
 
 def _analytic(given: dict[str, Any]) -> Domain | None:

@@ -237,7 +237,7 @@ def _ready(
         choose_domain(run.config, [named], console, closed=True)
     key = f"{run.config.surface} {run.config.domain}"
     if key not in surfaces:
-        surfaces[key] = configured_surface(run.config)
+        surfaces[key] = configured_surface(run.config, console)
         report_surface(console, surfaces[key])
     return member(run, surfaces[key], console)
 

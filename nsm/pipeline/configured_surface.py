@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Surface, domain
+from nsm.stages import stage
 
 
 def keep_absolute(config: DictConfig) -> None:
@@ -16,22 +19,31 @@ def keep_absolute(config: DictConfig) -> None:
         config.surface.path = os.path.abspath(config.surface.path)
 
 
-def configured_surface(config: DictConfig) -> Surface:
-    """The surface of the group ``surface``, prepared.
+def configured_surface(config: DictConfig, console: Console, given: Any = None) -> Surface:
+    """The surface of the group ``surface``, prepared; the console shows that it goes on.
+
+    Args:
+        given: a mesh in its place, as :meth:`Surface.load` takes it, or a prepared surface.
 
     Raises:
         NsmError: a mesh that cannot be used.
     """
+    if isinstance(given, Surface):
+        return given
     keep_absolute(config)
     settings = config.surface
-    return Surface.load(
-        settings.path if settings.path is not None else settings.name,
-        domain=domain(config.domain),
-        seam_vertices=settings.seam_vertices,
-        cones=settings.get("cones"),  # absent in older run folders
-        parameterization=settings.parameterization,
-        cache=settings.cache,
-    )
+    if given is None:
+        given = settings.path if settings.path is not None else settings.name
+    name = Path(given).stem if isinstance(given, (str, Path)) else "mesh"
+    with stage(console, f"preparing {name}"):
+        return Surface.load(
+            given,
+            domain=domain(config.domain),
+            seam_vertices=settings.seam_vertices,
+            cones=settings.get("cones"),  # absent in older run folders
+            parameterization=settings.parameterization,
+            cache=settings.cache,
+        )
 
 
 def report_surface(console: Console, surface: Surface) -> None:

@@ -47,8 +47,7 @@ class OverfitTask(Task):
         return [settings.name if settings.path is None else settings.path]
 
     def prepare(self, given: Given) -> None:
-        surface = given.surface
-        self.use(configured_surface(self.config) if surface is None else surface)
+        self.use(configured_surface(self.config, self.console, given.surface))
         report_surface(self.console, self.surface)
 
     def use(self, surface: Surface) -> None:

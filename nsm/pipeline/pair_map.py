@@ -24,6 +24,7 @@ from nsm.pipeline.resolve_inputs import (
     vertex_count,
 )
 from nsm.pipeline.task import Given, Task, frozen
+from nsm.pipeline.textures import Textures, read_textures, write_textured
 from nsm.results import (
     NeuralSurface,
     SurfaceMap,
@@ -58,6 +59,7 @@ class PairMapTask(Task):
     table = staticmethod(pair_table)
     picture_name = "map"
     attributes: dict[str, np.ndarray]
+    textures: Textures | None = None
     proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
@@ -65,12 +67,14 @@ class PairMapTask(Task):
         return [self.settings[key] if end is None else end for key, end in ends]
 
     def prepare(self, given: Given) -> None:
-        self.keep_absolute("source", "target", "landmarks", "attributes")
+        self.keep_absolute("source", "target", "landmarks", "attributes", "texture")
         settings = self.settings
+        ends = self.inputs(given)
         shapes = [
-            read_shape(settings[key] if end is None else end, self.domain, key, self.config.trust)
-            for key, end in (("source", given.source), ("target", given.target))
+            read_shape(end, self.domain, key, self.config.trust)
+            for key, end in zip(("source", "target"), ends, strict=True)
         ]
+        self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
         self.proposed = None
         if isinstance(landmarks, str) and landmarks == AUTO:
@@ -219,6 +223,9 @@ class PairMapTask(Task):
         if self.proposed is not None:
             (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
+        if self.textures is not None:
+            for line in write_textured(self.textures, folder, result, self.config.texture_size):
+                self.console.print(line)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface

@@ -22,6 +22,7 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 
@@ -39,7 +40,10 @@ class ParamTask(Task):
         return [] if ready is None else [ready]
 
     def prepare(self, given: Given) -> None:
-        self.use(neural_surface(self.config, self.console) if given.phi is None else given.phi)
+        phi = given.phi
+        if not isinstance(phi, NeuralSurface):
+            phi = neural_surface(self.config, self.console, phi)
+        self.use(phi)
 
     def use(self, phi: NeuralSurface) -> None:
         """Take the neural surface."""
@@ -81,6 +85,7 @@ class ParamTask(Task):
         for ending, texture in (("obj", None), ("glb", checkerboard())):
             file = folder / f"parameterized.{ending}"
             export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
+        write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
         before_after = {"before: domain Ω": surface.uv, "after": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 

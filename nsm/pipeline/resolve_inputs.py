@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nsm.domains import Domain, domain
+from nsm.domains import Domain, Surface, domain
 from nsm.domains.joint_preparation import Mesh, prepare_jointly
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
@@ -19,12 +18,13 @@ from nsm.pipeline.configured_surface import report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.results.analytic import lies_over
+from nsm.stages import stage
 from nsm.surfaces.catalogue import (
     catalogue_landmarks,
-    catalogue_mesh,
     catalogue_names,
     has_landmarks,
 )
+from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmark_files import Marks, read_collection, read_marks, read_pairs
 from nsm.surfaces.landmarks import (
     AtVertices,
@@ -34,7 +34,6 @@ from nsm.surfaces.landmarks import (
     check_equal_lengths,
     listed,
 )
-from nsm.surfaces.loading import load_mesh
 
 Shape = NeuralSurface | Mesh
 _MOVED = 1e-4  # percent of the diagonal: less is the rounding of a file's digits
@@ -44,8 +43,10 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
     """The surface that a user names.
 
     Args:
-        given: a NeuralSurface; the folder of one; a mesh file; a name of the catalogue; or an
-            analytic surface, as ``{"name": ..., parameters}`` or, for a target, by its name.
+        given: a NeuralSurface; the folder of one; a mesh file; a name of the catalogue; an object
+            of trimesh; arrays (V, 3), (F, 3); a prepared Surface, which is prepared again for the
+            map; or an analytic surface, as ``{"name": ..., parameters}`` or, for a target, by its
+            name.
         domain: on which the surface has to lie.
         key: the setting's name, for messages.
         trust: modules whose classes a run folder may name, beside those of nsm and torch.
@@ -61,26 +62,29 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
         )
     if isinstance(given, dict):
         return analytic_surface(given, domain)
-    if not isinstance(given, (NeuralSurface, str, Path)):
-        raise NsmError(
-            f"setting {key}: a {type(given).__name__} is no surface; give a neural surface, a mesh "
-            "file, a catalogue name or a run folder",
-            kind="wrong_type",
-            key=key,
-        )
+    if isinstance(given, Surface):
+        if given.raw is None:
+            raise NsmError(
+                f"{key}={given.name}: a surface of a run folder has no mesh to prepare again; give "
+                "its neural surface or the mesh file",
+                kind="wrong_type",
+                key=key,
+            )
+        return Mesh(given.name, *given.raw)
     if isinstance(given, NeuralSurface):
         ready = given
+    elif not isinstance(given, (str, Path)):
+        mesh = given_mesh(given, key)
+        return Mesh(mesh.name, mesh.vertices, mesh.faces, mesh.log)
     else:
         name = str(given)
         if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
             ready = load_surface(name, trust=trust)
         elif key == "target" and _is_analytic(name, domain):
             return analytic_surface({"name": name}, domain)
-        elif Path(name).suffix or os.sep in name or Path(name).exists():
-            vertices, faces, log = load_mesh(name)
-            return Mesh(Path(name).stem, vertices, faces, tuple(log))
         else:
-            return Mesh(name, *catalogue_mesh(name))
+            mesh = given_mesh(name)
+            return Mesh(mesh.name, mesh.vertices, mesh.faces, mesh.log)
     if ready.surface.domain != domain:
         raise NsmError(
             f"{key}={ready.surface.name}: it lies on the {ready.surface.domain}, but domain="
@@ -264,15 +268,16 @@ def neural_surfaces(
     ready = {k: shape for k, shape in enumerate(shapes) if isinstance(shape, NeuralSurface)}
     if meshes:
         alone = len(meshes) == 1
-        prepared = prepare_jointly(
-            list(meshes.values()),
-            [np.zeros(0, np.int64) if alone else landmarks[k] for k in meshes],
-            domain=domain(config.domain),
-            parameterization=config.surface.parameterization,
-            seam=config.seam.path,
-            seam_landmarks=config.seam.landmarks,
-            cache=config.surface.cache,
-        )
+        with stage(console, f"preparing {', '.join(mesh.name for mesh in meshes.values())}"):
+            prepared = prepare_jointly(
+                list(meshes.values()),
+                [np.zeros(0, np.int64) if alone else landmarks[k] for k in meshes],
+                domain=domain(config.domain),
+                parameterization=config.surface.parameterization,
+                seam=config.seam.path,
+                seam_landmarks=config.seam.landmarks,
+                cache=config.surface.cache,
+            )
         for surface in prepared:
             report_surface(console, surface)
         ready.update(zip(meshes, cached_surfaces(prepared, config, console), strict=True))

@@ -17,13 +17,14 @@ from nsm.pipeline.checkpoints import CHECKPOINT_FILE
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.process_state import process_state
 from nsm.pipeline.task import Given, Task
-from nsm.pipeline.training import Run, stored_config, trained
+from nsm.pipeline.training import Run, check_device, stored_config, trained
 from nsm.results import atomic_write
 from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
 from nsm.results.files import as_json
 from nsm.results.loggers import check_packages, log_figures, loggers_of
 from nsm.run_directories import is_temporary
+from nsm.stages import stage
 from nsm.tasks.ensemble import Ensemble
 
 
@@ -51,6 +52,7 @@ def run_task(
     given: Given | None = None,
     *,
     resuming: bool = False,
+    quiet: bool = False,
 ) -> Any:
     """Run the task that ``config.task`` names, and leave all results in the folder.
 
@@ -61,6 +63,7 @@ def run_task(
         folder: the run folder, which the caller holds.
         given: inputs, instead of those that the configuration names.
         resuming: go on from the folder's checkpoint.
+        quiet: print nothing.
 
     Returns:
         The task's result.
@@ -70,7 +73,9 @@ def run_task(
     """
     started = time.monotonic()
     with process_state():
-        task = make_task(config, Console(highlight=False, markup=False))
+        console = Console(highlight=False, markup=False, quiet=quiet)
+        task = make_task(config, console)
+        check_device(config)
         check_packages(config.logger)
         task.choose_domain(given or Given())
         task.prepare(given or Given())
@@ -102,7 +107,8 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
         run: of the task.
         started: when the run began, by ``time.monotonic``.
     """
-    module, data = built(task), task.build_data()
+    with stage(task.console, f"{task.title}: network and samples"):
+        module, data = built(task), task.build_data()
     trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
     while task.begin_again(module):
         # first this, then the new settings: a run that is killed between does the same again
@@ -157,17 +163,17 @@ def finish(
     figures: dict[str, Any] = {}
     if task.certified:
         assert data is not None
-        result, figures = certified(task, module, data)
+        with stage(task.console, f"{task.title}: certificate"):
+            result, figures = certified(task, module, data)
     else:
         result = task.make_result(module)
-    task.measure(result)
-    task.save(run.folder, result)
-    if task.table is not None:
-        task.console.print(task.table(result.metrics))
-    for warning in task.warnings(result):
-        task.console.print(warning, soft_wrap=True)
+    with stage(task.console, f"{task.title}: figures"):
+        task.measure(result)
+        task.save(run.folder, result)
+    _print_figures(task, run, result, time.monotonic() - started)
     if task.config.artefacts:
-        task.write_artefacts(run.folder, result)
+        with stage(task.console, f"{task.title}: pictures and meshes"):
+            task.write_artefacts(run.folder, result)
     ensemble = trainer.lightning_module
     if isinstance(ensemble, Ensemble):
         figures["batched"] = len(ensemble.each)
@@ -184,6 +190,21 @@ def finish(
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
-    if not is_temporary(run.folder):
+    if not is_temporary(run.folder) and not run.inner:
         task.console.print(f"results in {run.folder}", soft_wrap=True)
     return result
+
+
+def _print_figures(task: Task, run: Run, result: Any, seconds: float) -> None:
+    """A table and warnings; of a neural surface that a map needs, one line."""
+    if run.inner:
+        task.console.print(
+            f"{task.surface.name}: neural surface in {seconds:.0f} s, RMS distance "
+            f"{result.metrics['rms_percent']:.3f} % of the diagonal",
+            soft_wrap=True,
+        )
+        return
+    if task.table is not None:
+        task.console.print(task.table(result.metrics))
+    for warning in task.warnings(result):
+        task.console.print(warning, soft_wrap=True)

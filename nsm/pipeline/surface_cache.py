@@ -61,13 +61,16 @@ _HARDWARE = (
 )
 
 
-def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
+def neural_surface(config: DictConfig, console: Console, given: Any = None) -> NeuralSurface:
     """The neural surface that a map's configuration names, made if it is not there yet.
+
+    Args:
+        given: in its place, a mesh as :meth:`Surface.load` takes it, or a prepared surface.
 
     Raises:
         NsmError: a mesh, neural surface or setting that cannot be used.
     """
-    if config.phi.path is not None:
+    if given is None and config.phi.path is not None:
         phi = load_surface(config.phi.path, trust=config.trust)
         if phi.surface.domain != domain(config.domain):
             raise NsmError(
@@ -77,7 +80,7 @@ def neural_surface(config: DictConfig, console: Console) -> NeuralSurface:
                 key="phi.path",
             )
         return phi
-    surface = configured_surface(config)
+    surface = configured_surface(config, console, given)
     report_surface(console, surface)
     return cached_surfaces([surface], config, console)[0]
 
@@ -126,7 +129,7 @@ def _cached(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSu
 
 
 def _made(surface: Surface, overfit: DictConfig, folder: Path, console: Console) -> NeuralSurface:
-    run = Run(overfit, folder, resuming=(folder / CHECKPOINT_FILE).exists())
+    run = Run(overfit, folder, resuming=(folder / CHECKPOINT_FILE).exists(), inner=True)
     started, one = time.monotonic(), member(run, surface, console)
     phi: NeuralSurface = run_prepared(one.task, run, started)
     return phi
@@ -138,7 +141,9 @@ def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Cons
         for folder in sorted(missing):  # in one order, whichever process wants them
             locks.enter_context(FileLock(folder.with_suffix(".lock")))
         left = {folder: s for folder, s in missing.items() if not is_complete(folder)}
-        members = [member(Run(overfit, f, resuming=True), s, console) for f, s in left.items()]
+        members = [
+            member(Run(overfit, f, resuming=True, inner=True), s, console) for f, s in left.items()
+        ]
         stages = {one.run.stage for one in members}
         if len(members) < 2 or len(stages) > 1 or None in stages:
             return  # what was begun alone goes on alone

@@ -29,15 +29,15 @@ class Given:
     """Inputs that a caller has at hand, instead of those that the configuration names.
 
     Attributes:
-        surface: of task=overfit, prepared.
-        phi: the neural surface of task=param.
+        surface: of task=overfit, prepared, or as :meth:`Surface.load` takes it.
+        phi: of task=param, a neural surface, or as ``surface``.
         source, target: of task=pair_map, as :func:`nsm.pipeline.resolve_inputs.read_shape` takes
             them.
         surfaces: of task=collection_map, each the same.
         landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
     """
 
-    surface: Surface | None = None
+    surface: Any = None
     phi: Any = None
     source: Any = None
     target: Any = None

@@ -10,7 +10,7 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning.accelerators import CUDAAccelerator
+from pytorch_lightning.accelerators import CUDAAccelerator, MPSAccelerator
 from pytorch_lightning.callbacks import Callback, LearningRateMonitor
 from pytorch_lightning.loggers import Logger
 from rich.console import Console
@@ -31,7 +31,6 @@ from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
 from nsm.run_directories import is_temporary
 from nsm.settings import PRECISIONS
-from nsm.surfaces.cache import cache_folder
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble
 
@@ -78,11 +77,13 @@ class Run:
         config: as :func:`nsm.config.compose_config` gives it.
         folder: the run folder.
         resuming: go on from the folder's checkpoint, if there is one.
+        inner: it makes a neural surface that a map needs.
     """
 
     config: DictConfig
     folder: Path
     resuming: bool = False
+    inner: bool = False
 
     @property
     def checkpoint(self) -> Path | None:
@@ -143,13 +144,19 @@ def trained(
     guard = DivergenceGuard(console)
     callbacks: list[Callback] = [
         guard,
-        GradientWatch(settings.log_every, settings.stop_gradient_norm, settings.stop_window),
+        GradientWatch(settings.log_every, _stop_norm(config), settings.stop_window),
         AtomicCheckpoint(*(run.folder / CHECKPOINT_FILE for run in runs)),
         *_own_callbacks(config),
     ]
     if settings.progress:
         callbacks.append(
-            TrainingProgress(console, title, module.progress_figure, module.progress_form)
+            TrainingProgress(
+                console,
+                title,
+                module.progress_figure,
+                module.progress_form,
+                transient=runs[0].inner,
+            )
         )
     if config.logger:
         callbacks += [LearningRateMonitor(), Throughput(settings.log_every)]
@@ -202,7 +209,7 @@ def trained(
             close(trainer.loggers, "failed")
     if trainer.interrupted:
         how = f"; go on with: nsm resume={folder}"
-        if len(runs) > 1 or cache_folder() in folder.parents:  # of a sweep, or for a map
+        if len(runs) > 1 or runs[0].inner:  # of a sweep, or for a map
             how = "; the same command goes on"
         console.print(f"interrupted{'' if is_temporary(folder) else how}", soft_wrap=True)
         raise KeyboardInterrupt
@@ -210,6 +217,14 @@ def trained(
         take_over(trainer, folder / CHECKPOINT_FILE)
         trainer.loggers = loggers(trainer.global_step + 1)
     return trainer
+
+
+def _stop_norm(config: DictConfig) -> float | None:
+    """The norm of the mean loss's gradient under which the training stops."""
+    norm: float | None = config.trainer.stop_gradient_norm
+    if norm is None or config.trainer.stop_norm_of == "mean":
+        return norm
+    return norm / float(config.data.batch_size)
 
 
 def lightning_trainer(
@@ -244,6 +259,27 @@ def lightning_trainer(
             kind="no_such_device",
             key="trainer.accelerator",
         ) from error
+
+
+def check_device(config: DictConfig) -> None:
+    """Check that the chosen hardware is there, before anything takes time.
+
+    Raises:
+        NsmError: ``no_such_device``.
+    """
+    if accelerator_of(config) != "gpu" or MPSAccelerator.is_available():
+        return
+    count = CUDAAccelerator.auto_device_count()
+    if count < config.trainer.devices:
+        if count:
+            reason = f"there are {count} GPUs; give trainer.devices={count} or fewer"
+        else:
+            reason = "torch finds no GPU; give device=cpu, or install a driver and torch for it"
+        raise NsmError(
+            f"setting trainer.accelerator=gpu: {reason}",
+            kind="no_such_device",
+            key="trainer.accelerator",
+        )
 
 
 def accelerator_of(config: DictConfig) -> str:

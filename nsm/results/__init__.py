@@ -2,6 +2,7 @@
 
 from nsm.results.analytic import analytic_surface
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.baking import baked
 from nsm.results.collection import SurfaceCollection, collection_metrics, load_collection
 from nsm.results.collection_pictures import figures_picture, transfer_matrix_picture
 from nsm.results.files import atomic_write
@@ -32,6 +33,7 @@ from nsm.results.tables import (
     pair_table,
     warning_of_tears,
 )
+from nsm.results.textured_mesh import TexturedMesh
 from nsm.results.textures import checkerboard
 
 __all__ = [
@@ -42,6 +44,8 @@ __all__ = [
     "load_collection",
     "transfer_matrix_picture",
     "SurfaceMap",
+    "TexturedMesh",
+    "baked",
     "analytic_surface",
     "by_file_vertex",
     "distortion_picture",

@@ -140,7 +140,7 @@ def load_surface(folder: str | Path, trust: Iterable[str] = ()) -> NeuralSurface
     tensors, metadata = read_pair(path / STEM, FORMAT)
     try:
         about = metadata["surface"]
-        arrays = {name: tensors.pop(f"surface.{name}").numpy() for name in ARRAYS}
+        arrays: dict[str, Any] = {name: tensors.pop(f"surface.{name}").numpy() for name in ARRAYS}
         for name in OPTIONAL:
             if f"surface.{name}" in tensors:
                 arrays[name] = tensors.pop(f"surface.{name}").numpy()

@@ -71,7 +71,8 @@ class GradientWatch(Callback):
 
     Args:
         every: steps between two values in the log.
-        stop_norm: stop when the mean norm of the last ``window`` steps is below; None: never.
+        stop_norm: stop when the mean norm of the last ``window`` steps is below, with warm
+            restarts only where a wave ends; None: never.
         window: the number of steps that are averaged.
     """
 
@@ -103,7 +104,7 @@ class GradientWatch(Callback):
         batch_idx: int,
     ) -> None:
         full = len(self.recent) == self.recent.maxlen
-        if self.stop_norm is not None and full:
+        if self.stop_norm is not None and full and _may_stop(trainer):
             if sum(self.recent) / len(self.recent) < self.stop_norm:
                 trainer.should_stop = True
 
@@ -112,6 +113,13 @@ class GradientWatch(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.recent.extend(state_dict["recent"])
+
+
+def _may_stop(trainer: pl.Trainer) -> bool:
+    """Whether no schedule of the training is within a wave, where its rate is still high."""
+    schedulers = [config.scheduler for config in trainer.lr_scheduler_configs]
+    waves = [s.wave_ends for s in schedulers if hasattr(s, "wave_ends")]
+    return all(ends(trainer.global_step) for ends in waves)
 
 
 class Pictures(Callback):

@@ -18,9 +18,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-# seconds between two lines in a log file, and between two updates of the bar
-_LINE_EVERY = 10.0
-_BAR_EVERY = 0.2
+from nsm.stages import QUIET_FOR, QUIET_SHARE
+
+_BAR_EVERY = 0.2  # seconds between two updates of the bar
 
 
 class TrainingProgress(Callback):
@@ -30,6 +30,7 @@ class TrainingProgress(Callback):
         console: where to write.
         title: what is being trained.
         key, form: the logged figure that is shown as the current error, and how.
+        transient: leave no bar behind.
     """
 
     def __init__(
@@ -38,15 +39,18 @@ class TrainingProgress(Callback):
         title: str,
         key: str = "val/rms_percent",
         form: str = "error {:.3f} %",
+        *,
+        transient: bool = False,
     ) -> None:
         self.console, self.title, self.key, self.form = console, title, key, form
+        self.transient = transient
         self.bar: Progress | None = None
         self.task: TaskID | None = None
         self.started = self.shown = 0.0
         self.first_step = 0
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.started = time.monotonic()
+        self.started = self.shown = time.monotonic()
         self.first_step = trainer.global_step
         if not self.console.is_terminal:
             return
@@ -59,6 +63,7 @@ class TrainingProgress(Callback):
             TimeRemainingColumn(),
             TextColumn("{task.fields[figures]}"),
             console=self.console,
+            transient=self.transient,
         )
         self.bar.start()
         self.task = self.bar.add_task(
@@ -74,7 +79,8 @@ class TrainingProgress(Callback):
         batch_idx: int,
     ) -> None:
         now = time.monotonic()
-        if now - self.shown < (_BAR_EVERY if self.bar else _LINE_EVERY):
+        pause = _BAR_EVERY if self.bar else max(QUIET_FOR, QUIET_SHARE * (now - self.started))
+        if now - self.shown < pause:
             return
         self.shown = now
         figures = f"loss {float(outputs['loss']):.2e}"
@@ -88,7 +94,8 @@ class TrainingProgress(Callback):
         seconds = (now - self.started) / max(1, step - self.first_step)
         left = seconds * (trainer.max_steps - step)
         self.console.print(
-            f"{self.title}  step {step}/{trainer.max_steps}  left {left:.0f} s  {figures}"
+            f"{self.title}  step {step}/{trainer.max_steps}  left {left:.0f} s  {figures}",
+            soft_wrap=True,
         )
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:

@@ -54,7 +54,20 @@ def rasterise(
         pixels (P,) flat indices of those covered, their face (P,) and its barycentric
         coordinates (P, 3).
     """
-    corners, z = xy[faces], depth[faces]
+    pixel, face, weights = covering(xy, faces, size)
+    near = (weights * depth[faces[face]]).sum(axis=1)
+    order = np.lexsort((near, pixel))
+    last = np.flatnonzero(np.diff(pixel[order], append=-1))
+    chosen = order[last]
+    return pixel[chosen], face[chosen], weights[chosen]
+
+
+def covering(
+    xy: np.ndarray, faces: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every face at each pixel of a square picture: as :func:`rasterise`, with a row for each pair
+    of a pixel and a face that contains its centre."""
+    corners = xy[faces]
     # skip triangles that are not finite or far larger than the picture
     visible = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < 4 * size).all(axis=(1, 2))
     kept = np.where(visible[:, None, None], corners, 0.0)
@@ -62,24 +75,20 @@ def rasterise(
     span = (np.ceil(kept.max(axis=1)).astype(np.int64) - low).max(axis=1) + 1
     side = 2 ** np.ceil(np.log2(span)).astype(np.int64)
     nothing = np.zeros(0, dtype=np.int64)
-    hits: list[tuple[np.ndarray, ...]] = [(nothing, np.zeros(0), nothing, np.zeros((0, 3)))]
+    hits: list[tuple[np.ndarray, ...]] = [(nothing, nothing, np.zeros((0, 3)))]
     for width in np.unique(side[visible]):
         group = np.flatnonzero(visible & (side == width))
         step = np.stack(np.meshgrid(np.arange(width), np.arange(width)), axis=-1).reshape(-1, 2)
         chunk = max(1, _CHUNK // len(step))
         for start in range(0, len(group), chunk):
             face = group[start : start + chunk]
-            hits.append(_covered(corners[face], z[face], low[face], step, size, face))
-    pixel, near, face, weights = (np.concatenate(parts) for parts in zip(*hits, strict=True))
-    order = np.lexsort((near, pixel))
-    last = np.flatnonzero(np.diff(pixel[order], append=-1))
-    chosen = order[last]
-    return pixel[chosen], face[chosen], weights[chosen]
+            hits.append(_covered(corners[face], low[face], step, size, face))
+    pixel, face, weights = (np.concatenate(parts) for parts in zip(*hits, strict=True))
+    return pixel, face, weights
 
 
 def _covered(
     corners: np.ndarray,
-    z: np.ndarray,
     low: np.ndarray,
     step: np.ndarray,
     size: int,
@@ -97,7 +106,7 @@ def _covered(
     i, j = np.nonzero(inside)
     weights = np.stack([w0[i, j], w1[i, j], w2[i, j]], axis=1)
     pixel = place[i, j, 1] * size + place[i, j, 0]
-    return pixel, (weights * z[i]).sum(axis=1), face[i], weights
+    return pixel, face[i], weights
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -21,8 +21,10 @@ from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.networks import placed_map
 from nsm.results.points import as_points, as_values
+from nsm.results.textured_mesh import LARGEST_SIZE, TexturedMesh, painted, read_file_mesh
 from nsm.results.welding import Weld, weld
 from nsm.surfaces.location import Places, locate
+from nsm.surfaces.textures import read_texture
 
 FORMAT = "nsm-surface-map"
 STEM = "pair"
@@ -120,6 +122,18 @@ class SurfaceMap:
         """Images (V, 3) of the cut source's vertices on the target, in normalised units."""
         return self.target.surface.at(self.image_uv)
 
+    def places(self, given: Places, *, back: bool = False) -> Places:
+        """Where places on the source's mesh go on the target's, or, with ``back``, come from.
+
+        Args:
+            given: faces and barycentric coordinates on ``source.surface``, or on
+                ``target.surface`` with ``back``.
+        """
+        s, t = self.source.surface, self.target.surface
+        if back:
+            return s.domain.locate(given.take(t.uv, t.faces), self.image_uv, s.faces)
+        return t.domain.locate(given.take(self.image_uv, s.faces), t.uv, t.faces)
+
     @cached_property
     def weld(self) -> Weld:
         """The image with one point for all copies of a seam vertex (see :func:`weld`); copies of a
@@ -175,6 +189,39 @@ class SurfaceMap:
         else:
             moved = places.take(inner, start.faces)
         return by_file_vertex(end, moved)
+
+    def bake(
+        self,
+        source: str | Path,
+        target: str | Path,
+        *,
+        texture: str | Path | None = None,
+        back: bool = False,
+        size: int = 1024,
+    ) -> TexturedMesh:
+        """The texture of one mesh on the other: each texel has the colour of its preimage.
+
+        Args:
+            source, target: the mesh files, or names of the catalogue, that the map was made from.
+            texture: an image for the texture coordinates of the mesh that it is carried from; by
+                default that file's own materials.
+            back: from the target to the source.
+            size: texels a side of the new image, 1 to 8192.
+
+        Returns:
+            The target's mesh, or the source's with ``back``: ``.export("painted.glb")`` writes it.
+
+        Raises:
+            NsmError: ``missing_uv``, ``missing_texture`` or ``missing_file`` of the mesh that the
+                texture is on; ``wrong_mesh`` for other meshes than the map's; ``out_of_range``.
+        """
+        if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= LARGEST_SIZE:
+            message = f"size: {size!r} is not a whole number from 1 to {LARGEST_SIZE}"
+            raise NsmError(message, kind="out_of_range", key="size")
+        ends = [target, source] if back else [source, target]
+        paint = read_texture(ends[0], texture)
+        start, end = (read_file_mesh(one) for one in ends)
+        return painted(self, start, paint, end, back=back, size=size)
 
     def morph(self, t: float) -> np.ndarray:
         """Vertices (V, 3) on straight lines from the source (t = 0) to the target (t = 1).

@@ -18,6 +18,7 @@ _LARGEST_JSON = 100 * 2**20  # bytes
 _MOST_NODES = 10_000  # of a scene, with repetitions
 _DEEPEST = 100  # nested nodes
 _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+_UNMOVED = {"offset": [0, 0], "scale": [1, 1], "rotation": 0, "texCoord": 0}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
@@ -87,6 +88,40 @@ def check_gltf(file: Path) -> None:
             if not isinstance(k, int) or not 0 <= k < len(nodes):
                 raise ValueError("a node is missing")
             stack += [(child, depth + 1) for child in nodes[k].get("children", [])]
+
+
+def check_images(file: Path) -> None:
+    """Check that the image files of a glTF or GLB file are there: trimesh would leave them out.
+
+    Raises:
+        ValueError: one is missing, or outside the folder.
+    """
+    resolver = FolderResolver(file.parent)
+    for image in _listed(_tree(file), "images"):
+        place = str(image.get("uri", "data:"))
+        if not place.startswith("data:"):
+            resolver.get(place)
+
+
+def check_textures(file: Path) -> None:
+    """Check that base-colour images are placed by the first texture coordinates as they are.
+
+    Raises:
+        ValueError: by a second set of them, or moved by KHR_texture_transform, which trimesh does
+            not know.
+    """
+    for material in _listed(_tree(file), "materials"):
+        texture = _mapping(_mapping(material, "pbrMetallicRoughness"), "baseColorTexture")
+        if texture.get("texCoord", 0) != 0:
+            raise ValueError("an image has texture coordinates other than the first ones")
+        moved = _mapping(_mapping(texture, "extensions"), "KHR_texture_transform")
+        if any(moved.get(key, plain) != plain for key, plain in _UNMOVED.items()):
+            raise ValueError("an image is moved (KHR_texture_transform); apply that to the UV")
+
+
+def _mapping(item: dict[str, Any], key: str) -> dict[str, Any]:
+    value = item.get(key)
+    return value if isinstance(value, dict) else {}
 
 
 def _tree(file: Path) -> dict[str, Any]:

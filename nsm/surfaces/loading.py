@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from nsm.errors import NsmError
+from nsm.surfaces.obj import read_obj, text_of
 
 _LONGEST_HEADER = 100_000  # bytes
 LARGEST_FILE = 4 * 2**30  # bytes
@@ -134,50 +135,59 @@ def check_arrays(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
 _Read = tuple[np.ndarray, np.ndarray, list[str]]
 
 
-def _triangulated(vertices: Any, polygons: Iterable[Sequence[int]]) -> _Read:
-    """Vertices (V, 3), and polygons split into triangle fans."""
+def fans(polygons: Iterable[Sequence[int]]) -> tuple[np.ndarray, int]:
+    """Polygons split into triangle fans.
+
+    Args:
+        polygons: the vertices of each, in order.
+
+    Returns:
+        Triangles (F, 3) int64, whose entries are positions in the list of all corners of all
+        polygons; and how many polygons have more than three corners.
+
+    Raises:
+        ValueError: a polygon with fewer than three corners.
+    """
     rings = [list(polygon) for polygon in polygons]
     if any(len(ring) < 3 for ring in rings):
         raise ValueError("a face has fewer than three corners")
     larger = [ring for ring in rings if len(ring) > 3]
+    # Two quads may share two sides; the same diagonal in both would be a non-manifold edge, so a
+    # quad whose diagonal exists is split along its other one.
+    taken = set()
     if larger:
-        # Two quads may share two sides; the same diagonal in both would be a non-manifold edge, so
-        # a quad whose diagonal exists is split along its other one.
         taken = {frozenset(side) for r in rings for side in zip(r, r[1:] + r[:1], strict=True)}
-        for ring in larger:
+    triangles, start = [], 0
+    for ring in rings:
+        corners = list(range(start, start + len(ring)))
+        start += len(ring)
+        if len(ring) > 3:
             if frozenset((ring[0], ring[2])) in taken:
                 ring.append(ring.pop(0))
+                corners.append(corners.pop(0))
             taken.update(frozenset((ring[0], corner)) for corner in ring[2:-1])
-    triangles = [(ring[0], ring[i], ring[i + 1]) for ring in rings for i in range(1, len(ring) - 1)]
+        triangles += [(corners[0], *corners[i : i + 2]) for i in range(1, len(ring) - 1)]
+    return np.array(triangles, dtype=np.int64).reshape(-1, 3), len(larger)
+
+
+def _triangulated(vertices: Any, polygons: Sequence[Sequence[int]]) -> _Read:
+    """Vertices (V, 3), and polygons split into triangle fans."""
+    corners, larger = fans(polygons)
+    flat = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
     return (
         np.array(vertices, dtype=np.float64).reshape(-1, 3),
-        np.array(triangles, dtype=np.int64).reshape(-1, 3),
-        [f"{len(larger)} polygons triangulated"] if larger else [],
+        flat[corners],
+        [f"{larger} polygons triangulated"] if larger else [],
     )
 
 
 def _read_obj(file: Path) -> _Read:
-    vertices: list[list[float]] = []
-    polygons: list[list[int]] = []
-    text = _text(file).replace("\\\r\n", " ").replace("\\\n", " ")  # continued lines
-    for line in text.splitlines():
-        fields = line.split("#")[0].split()
-        if fields[:1] == ["v"]:
-            vertices.append([float(field) for field in fields[1:4]])
-        elif fields[:1] == ["f"]:
-            corners = []
-            for field in fields[1:]:
-                index = int(field.split("/")[0])
-                if index == 0:
-                    raise ValueError("a face uses vertex 0, but OBJ counts from 1")
-                # negative indices count back from the last vertex read
-                corners.append(index - 1 if index > 0 else len(vertices) + index)
-            polygons.append(corners)
-    return _triangulated(vertices, polygons)
+    obj = read_obj(file)
+    return _triangulated(obj.vertices, obj.polygons)
 
 
 def _read_off(file: Path) -> _Read:
-    lines = [line.split("#")[0].split() for line in _text(file).splitlines()]
+    lines = [line.split("#")[0].split() for line in text_of(file).splitlines()]
     rows = [row for row in lines if row]
     if not rows or "OFF" not in rows[0][0].upper():
         raise ValueError("no OFF header")
@@ -200,24 +210,41 @@ def _read_off(file: Path) -> _Read:
     return _triangulated(vertices, polygons)
 
 
-def _read_ply(file: Path) -> _Read:
+def read_ply(file: Path) -> tuple[dict[str, Any], list[str]]:
+    """The elements of a PLY file by name, each an array with named columns; and its comments.
+
+    Raises:
+        ValueError: it is damaged.
+    """
     from plyfile import PlyData
 
     _check_ply_header(file)
     with file.open("rb") as stream:
         ply = PlyData.read(stream)
-    elements = {element.name: element.data for element in ply.elements}
+    return {element.name: element.data for element in ply.elements}, list(ply.comments)
+
+
+def ply_polygons(face: Any) -> list[list[int]]:
+    """The vertices of each polygon of a PLY file's element ``face``.
+
+    Raises:
+        ValueError: it has none.
+    """
+    names = face.dtype.names or ()
+    key = next((n for n in ("vertex_indices", "vertex_index") if n in names), None)
+    if key is None:
+        raise ValueError("the face element has no vertex_indices")
+    return [list(map(int, row)) for row in face[key]]
+
+
+def _read_ply(file: Path) -> _Read:
+    elements, _ = read_ply(file)
     if "vertex" not in elements:
         raise ValueError("no vertex element")
     data = elements["vertex"]
     vertices = np.stack([np.asarray(data[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     if len(elements.get("face", ())):
-        face = elements["face"]
-        names = face.dtype.names or ()
-        key = next((n for n in ("vertex_indices", "vertex_index") if n in names), None)
-        if key is None:
-            raise ValueError("the face element has no vertex_indices")
-        return _triangulated(vertices, [list(map(int, row)) for row in face[key]])
+        return _triangulated(vertices, ply_polygons(elements["face"]))
     if len(elements.get("tristrips", ())):
         strips = elements["tristrips"]
         key = (strips.dtype.names or ("vertex_indices",))[0]
@@ -256,7 +283,12 @@ def _strip_triangles(strip: np.ndarray) -> np.ndarray:
     return triangles[(triangles >= 0).all(axis=1) & (a != b) & (b != c) & (c != a)]
 
 
-def _read_trimesh(file: Path) -> _Read:
+def read_scene(file: Path) -> list[Any]:
+    """The triangle meshes of an STL, glTF or GLB file, in their places, as trimesh has them.
+
+    Raises:
+        ValueError: it is damaged, or has no triangles.
+    """
     import trimesh
 
     from nsm.surfaces.gltf import FolderResolver, check_gltf
@@ -276,6 +308,11 @@ def _read_trimesh(file: Path) -> _Read:
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     if not meshes:
         raise ValueError("no triangles")
+    return meshes
+
+
+def _read_trimesh(file: Path) -> _Read:
+    meshes = read_scene(file)
     log = [f"{len(meshes)} meshes of the scene combined"] if len(meshes) > 1 else []
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     vertices = np.concatenate([np.asarray(m.vertices, dtype=np.float64) for m in meshes])
@@ -283,10 +320,3 @@ def _read_trimesh(file: Path) -> _Read:
         [np.asarray(m.faces, dtype=np.int64) + o for m, o in zip(meshes, offsets, strict=True)]
     )
     return vertices, faces, log
-
-
-def _text(file: Path) -> str:
-    raw = file.read_bytes()
-    if b"\0" in raw[:4096]:
-        raise ValueError("binary data where text is expected")
-    return raw.decode("utf-8-sig", errors="replace")

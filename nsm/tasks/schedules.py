@@ -70,9 +70,13 @@ class SGDR(LambdaLR):
     """Warm restarts: half-waves from the full rate to ``final`` of it (Loshchilov and Hutter,
     ICLR 2017).
 
+    With ``max_steps`` all waves are stretched by one factor, the one nearest to 1 for which the
+    last wave ends with the training: a training that ends within a wave ends at a high rate.
+
     Args:
         optimizer: whose rates are scheduled.
-        period: steps of the first wave.
+        max_steps: length of the training; None: waves are not stretched.
+        period: steps of the first wave, before stretching.
         period_factor: length of each wave relative to the one before, at least 1.
         final: share of the full rate at the end of a wave.
         warmup: steps of linear rise at the start.
@@ -85,6 +89,7 @@ class SGDR(LambdaLR):
     def __init__(
         self,
         optimizer: Optimizer,
+        max_steps: int | None = None,
         period: Count = 1000,
         period_factor: float = 2.0,
         final: Share = 0.0,
@@ -97,14 +102,38 @@ class SGDR(LambdaLR):
         if not period_factor >= 1:  # waves that shrink would end before the training does
             raise _out_of_range("period_factor", f"{period_factor} is not at least 1")
 
+        self.first = period if max_steps is None else _stretched(period, period_factor, max_steps)
+        self.factor = period_factor
+
         def course(step: float) -> float:
-            length = float(period)
-            while step >= length:
-                step -= length
-                length *= period_factor
-            return _wave(step / length, final)
+            done, length = self._place(step)
+            return _wave(done / length, final)
 
         super().__init__(optimizer, _share(course, warmup, peak))
+
+    def _place(self, step: float) -> tuple[float, float]:
+        """How many steps of its wave are done, and how many the wave has."""
+        length = float(self.first)
+        while step >= length - 1e-6 * self.first:  # rounding of a stretched wave
+            step -= length
+            length *= self.factor
+        return max(0.0, step), length
+
+    def wave_ends(self, step: int) -> bool:
+        """Whether a wave ends with ``step`` steps done, so that a training may stop there."""
+        return step > 0 and self._place(step)[0] < 1
+
+
+def _stretched(period: float, factor: float, max_steps: int) -> float:
+    """The period for which the waves nearest in length to ``max_steps`` last exactly so long."""
+    total, length = float(period), float(period)
+    while total + length * factor <= max_steps:
+        length *= factor
+        total += length
+    longer = total + length * factor
+    # nearer as a ratio: stretched and compressed alike
+    best = longer if total * longer < float(max_steps) ** 2 else total
+    return period * max_steps / best
 
 
 def _wave(share: float, final: float) -> float:

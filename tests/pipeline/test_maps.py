@@ -16,7 +16,11 @@ from nsm.errors import NsmError
 from nsm.pipeline import Given, run_task
 from nsm.pipeline.resolve_inputs import landmark_vertices
 from nsm.results.metrics import evaluate
+from nsm.results.textured_mesh import TexturedMesh
+from nsm.surfaces.atlas import unwrapped
 from nsm.surfaces.geometry import point_mesh_distance
+from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.textures import read_texture
 
 QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
 MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'
@@ -365,6 +369,42 @@ def test_closed_shapes_are_put_into_a_collection_through_their_landmarks(files):
         assert figures["landmark_error_max_percent"] < 2
 
 
+def test_textures_are_carried_both_ways_by_the_command(here, tmp_path):
+    """The source is painted in its own UV, the target in an atlas; both colours are constant."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    for name, colour in (("ball", [200, 30, 60]), ("egg", [20, 90, 210])):
+        vertices, faces = np.asarray(ball.vertices) * [1.0, 1.2, 0.9], np.asarray(ball.faces)
+        image = np.tile(np.array(colour, dtype=np.uint8), (32, 32, 1))
+        TexturedMesh(vertices, faces, unwrapped(vertices, faces), image).export(
+            tmp_path / f"{name}.obj"
+        )
+    run = here(
+        *QUICK,
+        MADE,
+        *("task=pair_map", "source=ball.obj", "target=egg.obj", "texture=own", "texture_size=64"),
+        *("trainer.max_steps=3", "logger=none", "trainer.progress=false", "artefacts=false"),
+        "hydra.run.dir=run",
+    )
+    assert run.returncode == 0, run.stderr
+    assert "texture on the target" in run.stdout and "texture on the source" in run.stdout
+    for name, end, colour in (
+        ("target_textured", "egg", [200, 30, 60]),
+        ("source_textured", "ball", [20, 90, 210]),
+    ):
+        for ending in ("obj", "glb"):
+            texture = read_texture(tmp_path / "run" / f"{name}.{ending}")
+            assert texture.images[0].shape == (64, 64, 3) and (texture.images[0] == colour).all()
+        for mine, other in zip(
+            load_mesh(tmp_path / "run" / f"{name}.obj")[:2],
+            load_mesh(tmp_path / f"{end}.obj")[:2],
+            strict=True,
+        ):
+            assert np.array_equal(mine, other)
+    f = nsm.load(tmp_path / "run")
+    mesh = f.bake(tmp_path / "ball.obj", tmp_path / "egg.obj", size=32)
+    assert (mesh.image == [200, 30, 60]).all()
+
+
 # with the kind of the error, and the name of the file, surface or setting concerned
 BAD = [
     ("landmarks=[[99999,1]]", "out_of_range", "a"),
@@ -381,6 +421,11 @@ BAD = [
     ("constraints.boundary=soft", "unknown_option", "constraints.boundary"),
     ("seam.path=sideways landmarks=[[1,1],[5,5]]", "unknown_option", "seam.path"),
     ("attributes.source=a.vts", "unreadable_file", "attributes.source"),
+    ("texture=own", "missing_texture", "a.obj"),
+    ("texture=nowhere.png", "missing_file", "nowhere.png"),
+    ("texture=broken.json", "unreadable_file", "broken.json"),
+    ("texture=own target=ready", "wrong_type", "texture"),
+    ("texture_size=0", "out_of_range", "texture_size"),
 ]
 
 

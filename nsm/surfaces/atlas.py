@@ -1,0 +1,54 @@
+"""Texture atlases: charts of a mesh side by side in the unit square."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nsm.surfaces.loading import error_in
+
+PADDING = 6  # texels between charts, at the size for which an atlas is packed
+# A chart has at most this share of the area. Smaller charts have more seams; the time of xatlas
+# grows faster than the number of a chart's faces, so those of large meshes are smaller.
+_LARGEST_CHART = 0.05
+_CHART_FACES = 2000
+
+
+def unwrapped(
+    vertices: np.ndarray, faces: np.ndarray, *, size: int = 1024, name: str = "mesh"
+) -> np.ndarray:
+    """An atlas of a mesh whose charts are little distorted and do not overlap (xatlas).
+
+    Args:
+        vertices: (V, 3), in any unit.
+        faces: (F, 3).
+        size: of the texture in texels, in which charts are kept :data:`PADDING` apart.
+        name: of the mesh, in errors.
+
+    Returns:
+        (F, 3, 2) texture coordinates in [0, 1] at the corners of the faces. Some charts may be
+        mirrored.
+
+    Raises:
+        NsmError: ``not_unwrapped``: no face has an area.
+    """
+    import xatlas
+
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+    if not area > 0:
+        raise error_in(
+            name, "not_unwrapped", "it has no area; give a mesh with texture coordinates"
+        )
+    atlas = xatlas.Atlas()
+    centred = (vertices - vertices.mean(axis=0)) / np.sqrt(area)
+    atlas.add_mesh(centred.astype(np.float32), faces.astype(np.uint32))
+    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
+    charts.max_chart_area = float(np.clip(_CHART_FACES / len(faces), 0.0, _LARGEST_CHART))
+    packing.padding, packing.resolution, packing.bilinear = PADDING, size, True
+    packing.rotate_charts = packing.rotate_charts_to_axis = False
+    atlas.generate(charts, packing)
+    _, index, uv = atlas[0]
+    # the width and height differ a little; one scale for both keeps angles
+    scale = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
+    return (uv.astype(np.float64) * scale)[index.astype(np.int64).reshape(-1, 3)]
