@@ -28,7 +28,11 @@ from nsm.sweeps import OUTCOMES, summary
 
 # What is no task: `nsm WORD ...` calls main([...]) of the module, which raises NsmError for bad
 # input. Imported only when called for.
-COMMANDS: dict[str, str] = {"report": "nsm.commands.report", "view": "nsm.commands.view"}
+COMMANDS: dict[str, str] = {
+    "landmarks": "nsm.commands.landmarks",
+    "report": "nsm.commands.report",
+    "view": "nsm.commands.view",
+}
 # Hydra's documented flags, and whether each has a value
 _HYDRA_FLAGS: dict[tuple[str, ...], dict[str, Any]] = {
     ("--hydra-help",): {"action": "store_true"},

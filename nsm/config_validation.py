@@ -30,7 +30,7 @@ SUPPLIED: dict[str, tuple[str, ...]] = {
     "map": ("out_dim", "activation", "encoding"),
     "encoding": ("in_dim",),
     "data": ("surface", "surfaces", "starts", "sampler", "seed"),
-    "optimizer": ("params", "groups"),
+    "optimizer": ("params", "groups", "fields"),
     "scheduler": ("optimizer", "max_steps"),
     "logger": ("folder", "first_step", "every"),
 }

@@ -218,6 +218,7 @@ Neural surface maps: meshes as networks, and maps between them.
   nsm resume=FOLDER                              continue an interrupted run
   nsm report FOLDER...                           compare runs on one page
   nsm view FOLDER                                show a run's shapes in the browser
+  nsm landmarks MESH MESH...                     place landmarks in the browser
   nsm --help NAME [...]                          about a group or a setting
   nsm --cfg job [...]                            print the settings, without a run
   nsm --debug [...]                              with tracebacks of errors"""

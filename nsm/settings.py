@@ -301,6 +301,8 @@ class TrainerSettings:
             hardware has them.
         compile: compile the evaluation of the networks: half a minute at the start, then faster
             steps; without a compiler nothing changes.
+        tabulated: cells a side of a table that stands for the target of a pair map in the
+            training; figures are those of the mesh. null: the target's network itself.
         progress: show a progress bar.
         gradient_clip: largest norm of a step's gradient; null: no limit.
         log_every: steps between two values in the logs.
@@ -315,6 +317,7 @@ class TrainerSettings:
     threads: Count | None = 1
     precision: Literal["float32", "tf32", "bf16"] = "float32"
     compile: bool = False
+    tabulated: Count | None = None
     progress: bool = True
     gradient_clip: Weight | None = None
     log_every: Count = 25
@@ -369,9 +372,11 @@ class ParamConstraints(Checked):
     Args:
         boundary: free; or fixed: h keeps to the domain by construction and its boundary slides,
             so that the map is bijective.
+        fold_every: steps between two looks for the mesh triangles nearest to folding.
     """
 
     boundary: Literal["free", "fixed"]
+    fold_every: Count = 25
 
 
 @dataclass(frozen=True)
@@ -385,6 +390,8 @@ class PairConstraints(Checked):
         multiplier_every: steps between two updates of the multipliers.
         ramp: share of the steps over which the weights of landmarks and seam rise to their values.
         fold_margin: what the determinant of J_h must stay above at the mesh triangles.
+        fold_every: steps between two looks for the mesh triangles nearest to folding.
+        multipliers_from: share of the steps before the multipliers' first update.
     """
 
     boundary: Literal["exact", "penalty"]
@@ -392,6 +399,8 @@ class PairConstraints(Checked):
     ramp: Share
     multiplier_every: Count = 50
     fold_margin: Share = 0.1
+    fold_every: Count = 25
+    multipliers_from: Share = 0.0
 
 
 @dataclass

@@ -79,7 +79,7 @@ def test_commands_can_be_given(page, capsys):
 
 
 def check_nsm(words, capsys):
-    if words[0] in ("report", "view"):
+    if words[0] in ("landmarks", "report", "view"):
         with pytest.raises(SystemExit):
             import_module(f"nsm.commands.{words[0]}").main(["--help"])
         described = capsys.readouterr().out
@@ -162,6 +162,16 @@ def test_tables_hold_what_was_measured(page, heading, files):
     measured = set().union(*(rows((RESULTS / file).read_text(encoding="utf-8")) for file in files))
     shown = rows(text[text.index(heading) :])
     assert shown and shown - measured == set()
+
+
+def test_the_table_of_proposals_holds_what_was_measured():
+    text = (ROOT / "docs" / "maps.md").read_text(encoding="utf-8")
+    section = text[text.index("## Landmarks proposed") : text.index("## Landmarks by hand")]
+    measured = json.loads((RESULTS / "correspondence.json").read_text(encoding="utf-8"))
+    names = [name for name in next(iter(measured.values()))["all"] if name != "best alternative"]
+    assert f"| shapes | {' | '.join(names)} |" in section
+    figures = {tuple(str(k["all"][name]) for name in names) for k in measured.values()}
+    assert rows(section) == figures
 
 
 def test_the_figures_of_the_front_page_were_measured():

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from nsm.arguments import Arguments
-from nsm.commands import add_trust
+from nsm.commands import add_address, add_trust
 from nsm.optional_dependencies import needed
 
 
@@ -26,14 +26,7 @@ def main(arguments: list[str]) -> None:
         "from another machine, forward the port with ssh -L 8080:localhost:8080 MACHINE.",
     )
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="a run folder")
-    parser.add_argument(
-        "--port", type=int, default=8080, help="default: %(default)s; 0 for any free port"
-    )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on; default: %(default)s, this machine only; 0.0.0.0 for all",
-    )
+    add_address(parser)
     add_trust(parser)
     given = parser.parse_args(arguments)
     needed("viser", "nsm view", "view")

@@ -39,9 +39,20 @@ class CoarseShape:
     tips: np.ndarray
     samples: np.ndarray
 
+    def spread_tips(self, count: int) -> np.ndarray:
+        """Numbers of up to ``count`` tips that are far from each other."""
+        apart = self.distance[np.ix_(self.tips, self.tips)]
+        return _spread(apart, [0], min(count, len(self.tips)))
 
-def coarse_shape(vertices: np.ndarray, faces: np.ndarray) -> CoarseShape:
+
+def coarse_shape(
+    vertices: np.ndarray, faces: np.ndarray, tips: np.ndarray | None = None
+) -> CoarseShape:
     """The coarse shape of a closed mesh (V, 3), (F, 3) of genus 0.
+
+    Args:
+        vertices, faces: the mesh.
+        tips: (K,) vertices that stand for the tips, which are found if not given.
 
     Raises:
         NsmError: ``wrong_topology`` for any other mesh; ``no_proposal`` for one with fewer than
@@ -58,7 +69,7 @@ def coarse_shape(vertices: np.ndarray, faces: np.ndarray) -> CoarseShape:
             kind="wrong_topology",
             key="landmarks",
         )
-    tips = extremities(vertices, faces, _TIPS)
+    tips = extremities(vertices, faces, _TIPS) if tips is None else tips
     if len(tips) < 4:
         raise NsmError(
             f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",

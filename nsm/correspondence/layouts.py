@@ -64,12 +64,22 @@ class Table:
         return np.asarray(self.vertex[i, j])
 
 
-def quick_scores(shape: CoarseShape) -> tuple[np.ndarray, np.ndarray]:
-    """All sets (S, 4) of four tips, and the mean log distortion (S,) of Tutte's embedding of each.
+def quick_scores(
+    shape: CoarseShape, tips: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """All sets of four tips, and how much Tutte's embedding of each distorts.
 
     Tutte's embedding alone orders sets much as the optimised one does, in a fraction of the time.
+
+    Args:
+        shape: the shape.
+        tips: numbers of the tips to choose from; all by default.
+
+    Returns:
+        sets (S, 4), and the mean logarithms (S,) of their distortion.
     """
-    sets = np.array(list(combinations(range(len(shape.tips)), 4)))
+    numbers = range(len(shape.tips)) if tips is None else tips.tolist()
+    sets = np.array(list(combinations(numbers, 4)))
     vertices, faces = shape.vertices, shape.faces
     weights, area = (
         edge_weights(vertices, faces, "mean_value"),

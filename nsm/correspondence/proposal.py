@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,8 @@ _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which 
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
 _AROUND = 0.3  # a tip's neighbourhood, over √area
-_LEAST_MARGIN = 0.15
-_LARGEST_ENERGY = 10.0
+_LEAST_MARGIN = 0.2
+_LARGEST_SCORE = 3.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Proposal:
     @property
     def sure(self) -> bool:
         """Whether the first is far ahead of the second, and good in itself."""
-        return self.margin > _LEAST_MARGIN and self.hypotheses[0].energy < _LARGEST_ENERGY
+        return self.margin > _LEAST_MARGIN and self.hypotheses[0].score < _LARGEST_SCORE
 
 
 def proposed(
@@ -77,6 +78,21 @@ def proposed(
             kept.append(hypothesis)
     margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
     return Proposal(kept, margin)
+
+
+def proposed_for_all(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Landmarks (L, k) of k closed meshes: those proposed for the first and each other one.
+
+    Args:
+        meshes: vertices (V, 3) and faces (F, 3) of each.
+
+    Raises:
+        NsmError: as :func:`proposed`.
+    """
+    pairs = [proposed(meshes[0], other).hypotheses[0].vertices for other in meshes[1:]]
+    common = [v for v in pairs[0][:, 0] if all(v in found[:, 0] for found in pairs)]
+    rows = [[v, *(found[found[:, 0] == v, 1][0] for found in pairs)] for v in common]
+    return np.array(rows, dtype=np.int64).reshape(-1, len(meshes))
 
 
 def _hypothesis(candidate: Candidate) -> Hypothesis:

@@ -93,7 +93,7 @@ def candidates(
         for candidate in _starts(s, t, looked_up)
     ]
     for one in rounds:
-        found = _trained(sorted(found, key=lambda c: c.cost)[: one.maps], one)
+        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one)
     return sorted(found, key=lambda c: c.cost)
 
 
@@ -154,7 +154,7 @@ def _changes(source: CoarseShape, target: CoarseShape, images: np.ndarray) -> np
     return np.asarray(np.abs(before - after).mean(axis=(-1, -2)))
 
 
-def _trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
+def trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
     """The candidates after a round of trainings; those of one source's layout in one batch."""
     waves = len(Sines.up_to(one.largest).waves)
     by_source: dict[int, list[Candidate]] = {}

@@ -1,6 +1,7 @@
 """Lightning data modules over prepared surfaces; samples are drawn on the training's device."""
 
 from nsm.data.collection import CollectionData
+from nsm.data.levels import LevelData
 from nsm.data.sampler import Draws, Sampler
 from nsm.data.sampling import Samples, SurfaceSampler
 from nsm.data.surface import EnsembleData, SurfaceData
@@ -9,6 +10,7 @@ __all__ = [
     "CollectionData",
     "Draws",
     "EnsembleData",
+    "LevelData",
     "Sampler",
     "Samples",
     "SurfaceData",

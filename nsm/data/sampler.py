@@ -28,13 +28,19 @@ class Sampler:
             shares add up to at most 1; the rest of a batch is uniform by area.
         pool: None: draw afresh in each step; a number: draw so many points once, all vertices
             among them (as published), and pick the batches from these.
+        stratified: spread the points that are uniform by area evenly, one to each of as many parts
+            of equal area.
 
     Raises:
         ValueError: a share outside [0, 1], a sum above 1, or a pool below 1.
     """
 
     def __init__(
-        self, vertex_share: Share = 0.0, domain_share: Share = 0.0, pool: Count | None = None
+        self,
+        vertex_share: Share = 0.0,
+        domain_share: Share = 0.0,
+        pool: Count | None = None,
+        stratified: bool = False,
     ) -> None:
         for name, share in (("vertex_share", vertex_share), ("domain_share", domain_share)):
             if not 0 <= share <= 1:
@@ -44,6 +50,7 @@ class Sampler:
         if pool is not None and pool < 1:
             raise ValueError(f"pool {pool} is not at least 1")
         self.vertex_share, self.domain_share, self.pool = vertex_share, domain_share, pool
+        self.stratified = stratified
         self.fixed: Samples | None = None
 
     def setup(self, surface: SurfaceSampler, seed: int) -> None:
@@ -60,7 +67,7 @@ class Sampler:
             return Samples(*(part[index] for part in self.fixed))
         at_vertices = round(count * self.vertex_share)
         in_domain = min(round(count * self.domain_share), count - at_vertices)
-        samples = surface.by_area(count - at_vertices - in_domain, generator)
+        samples = surface.by_area(count - at_vertices - in_domain, generator, self.stratified)
         if in_domain:
             samples = join(samples, surface.in_domain(in_domain, generator))
         if at_vertices:

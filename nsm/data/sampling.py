@@ -65,9 +65,21 @@ class SurfaceSampler:
         generator.manual_seed((seed * 1_000_003 + step) % (2**63))
         return generator
 
-    def by_area(self, count: int, generator: torch.Generator) -> Samples:
-        """``count`` points, uniform by area of the mesh."""
-        return self._at(*self._places(count, generator))
+    def by_area(
+        self, count: int, generator: torch.Generator, stratified: bool = False
+    ) -> Samples:
+        """``count`` points, uniform by area of the mesh.
+
+        Stratified, one lies in each of ``count`` parts of equal area, so that sums over them vary
+        less; parts consist of triangles that follow each other.
+        """
+        if not stratified:
+            return self._at(*self._places(count, generator))
+        face, weights = self._places(count, generator)
+        dice = torch.rand(count, generator=generator, device=self.device, dtype=torch.float64)
+        parts = torch.arange(count, device=self.device, dtype=torch.float64)
+        face = torch.searchsorted(self.cumulative_area, (parts + dice) / count)
+        return self._at(face.clamp(max=len(self.faces) - 1), weights)
 
     def with_jacobian(
         self, count: int, boundary_every: int, generator: torch.Generator

@@ -11,6 +11,8 @@ from nsm.maps.inverse import TransitionMap, inverted
 from nsm.maps.lattice_grid import LatticeSplineGrid
 from nsm.maps.networks import BLOCKS, NeuralMap, build_network, build_stored
 from nsm.maps.planar import DiscMap, IdentityInitializedMap, PlanarMap, SquareMap
+from nsm.maps.spline_field import SplineField
+from nsm.maps.tabulated import Remembered, Tabulated
 
 __all__ = [
     "ANALYTIC",
@@ -31,10 +33,13 @@ __all__ = [
     "PlanarMap",
     "PointMap",
     "RandomFourierFeatures",
+    "Remembered",
     "Rotated",
+    "SplineField",
     "SplineGrid",
     "SquareMap",
     "TorusMap",
+    "Tabulated",
     "TransitionMap",
     "as_activation",
     "batched",

@@ -19,6 +19,7 @@ from nsm.maps.encodings import (
     value_and_jacobian_stack,
 )
 from nsm.maps.mlp_with_tangents import MLPWithTangents
+from nsm.maps.spline_field import SplineField
 
 
 class PostActivationBlock(nn.Module):
@@ -262,7 +263,7 @@ def build_network(
     network: nn.Module = made_with(settings, out_dim=out_dim, **parts)
     if not hasattr(network, "value_and_jacobian"):
         network = ForeignMap(network)
-    if type(network) is not NeuralMap:
+    if not isinstance(network, (NeuralMap, SplineField)):  # these describe themselves
         configs = {key: part.config for key, part in parts.items()}
         network.config = {**settings, "out_dim": out_dim, **configs}  # type: ignore[assignment]
     return network

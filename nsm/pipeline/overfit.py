@@ -9,7 +9,7 @@ import numpy as np
 
 from nsm.data import SurfaceData
 from nsm.domains import Surface
-from nsm.pipeline.configured_surface import configured_surface, report_surface
+from nsm.pipeline.configured_surface import configured_surface, keep_absolute, report_surface
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
@@ -40,9 +40,11 @@ class OverfitTask(Task):
     start: Overfit | None = None
 
     def inputs(self, given: Given) -> list[Any]:
+        if given.surface is not None:
+            return [given.surface]
+        keep_absolute(self.config)
         settings = self.config.surface
-        named = settings.name if settings.path is None else settings.path
-        return [named if given.surface is None else given.surface]
+        return [settings.name if settings.path is None else settings.path]
 
     def prepare(self, given: Given) -> None:
         surface = given.surface

@@ -14,7 +14,7 @@ from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
-from nsm.maps import LatticeAligned, Rotated
+from nsm.maps import AnalyticSurface, Remembered, Tabulated, LatticeAligned, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.proposed_landmarks import AUTO, ProposedLandmarks, propose_landmarks
 from nsm.pipeline.resolve_inputs import (
@@ -109,6 +109,7 @@ class PairMapTask(Task):
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
         start = self._start(p, q)
+        phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
             corners = torch.from_numpy(self.domain.corners).to(p)
@@ -121,9 +122,18 @@ class PairMapTask(Task):
             start=start,
             mesh=(uv, torch.as_tensor(source.faces)),
             diagonal=target.bounding_box_diagonal,
-            phi=self.phi.map,
-            psi=self.psi.map,
+            phi=phi,
+            psi=psi,
         )
+
+    def _for_training(self) -> tuple[torch.nn.Module, torch.nn.Module]:
+        """φ and ψ as the training evaluates them."""
+        cells, psi = self.config.trainer.tabulated, self.psi.map
+        if cells is None:
+            return self.phi.map, psi
+        if not isinstance(psi, AnalyticSurface):  # whose formulas are as fast
+            psi = Tabulated(psi, cells, periodic=not self.domain.has_boundary)
+        return Remembered(self.phi.map), psi
 
     def _start(self, p: torch.Tensor, q: torch.Tensor) -> Rotated | LatticeAligned:
         """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)

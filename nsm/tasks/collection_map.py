@@ -78,8 +78,8 @@ class CollectionMap(ConstrainedMap):
             start.around(planar_map(onto, map, activation, encoding)) for start in starts
         )
         self.phis = nn.ModuleList(phi.eval().requires_grad_(False) for phi in phis)
-        margin = self.constraints.fold_margin
-        self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh, margin=margin) for _ in phis)
+        held = self.constraints
+        self.fold_barrier = nn.ModuleList(FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every) for _ in phis)
         start = torch.stack([h.before(points) for h in self.map])  # type: ignore[operator]
         self.set_landmarks(points, targets, start, seam)
         self.diagonals = diagonals

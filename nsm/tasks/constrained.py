@@ -69,6 +69,7 @@ class ConstrainedMap(Training):
         self.loss_terms = made_terms(loss_terms or {})
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
+        self.multipliers_from = self.constraints.multipliers_from * max_steps
         # h maps Ω to itself by construction
         self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 
@@ -109,6 +110,8 @@ class ConstrainedMap(Training):
         held = self.constraints
         if held.landmarks != "augmented" or not len(self.points) or self.ramp < 1:
             return
+        if self.global_step < self.multipliers_from:
+            return
         if self.global_step % held.multiplier_every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
@@ -118,7 +121,7 @@ class ConstrainedMap(Training):
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of
         folding triangles is ten times as large and acts on more of them, in small steps."""
         self.loss_weights = stronger(self.loss_weights)
-        self.ramp_steps = 0.0
+        self.ramp_steps = self.multipliers_from = 0.0
         further_training(self, steps)
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:

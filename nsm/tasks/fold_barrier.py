@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from nsm.energies import unfold
 
 _COUNT = 256
-_EVERY = 25  # steps between two looks at the triangles
 # triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
 _LOOK = 16_384
 
@@ -30,6 +29,7 @@ class FoldBarrier(nn.Module):
         areas: (F,) of each triangle before the map; by default its area in Ω.
         margin: relative signed area under which a triangle is penalised (see
             :func:`nsm.energies.unfold`).
+        every: steps between two looks at the triangles.
     """
 
     uv: Tensor
@@ -38,10 +38,15 @@ class FoldBarrier(nn.Module):
     chosen: Tensor
 
     def __init__(
-        self, uv: Tensor, faces: Tensor, areas: Tensor | None = None, margin: float = 0.1
+        self,
+        uv: Tensor,
+        faces: Tensor,
+        areas: Tensor | None = None,
+        margin: float = 0.1,
+        every: int = 25,
     ) -> None:
         super().__init__()
-        self.margin = margin
+        self.margin, self.every = margin, every
         self.register_buffer("uv", uv, persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         double = _double_areas(uv[faces]) if areas is None else 2 * areas
@@ -53,12 +58,15 @@ class FoldBarrier(nn.Module):
         # in the state, so that resumed training goes on with the same ones
         chosen = torch.arange(min(count, len(self.faces)), device=self.faces.device)
         self.register_buffer("chosen", chosen)
+        self._looked: int | None = None
 
     def forward(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
         """Mean ``unfold`` over the weakest triangles under h: a scalar."""
-        if step % _EVERY == 0:
+        # optimizers may evaluate the loss of a step several times: it must stay the same
+        if step % self.every == 0 and step != self._looked:
+            self._looked = step
             with torch.no_grad():
-                self._look(h, step // _EVERY)
+                self._look(h, step // self.every)
         corners = self.uv[self.faces[self.chosen]]
         image = h(corners.reshape(-1, 2)).reshape(-1, 3, 2)
         relative = _double_areas(image) / self.area[self.chosen]

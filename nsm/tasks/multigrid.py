@@ -110,7 +110,7 @@ def lattice_refinements(grid: LatticeSplineGrid, level: int) -> list[csr_matrix]
     ups = []
     while n * m > _DIRECT**2 and n % 2 == 0 and m % 4 == 0:
         n, m = n // 2, m // 2
-        both = kron(_periodic_refinement(n), _periodic_refinement(m)).tocsr()
+        both = kron(periodic_refinement_along(n), periodic_refinement_along(m)).tocsr()
         fine, coarse = folding(grid, 2 * n, 2 * m), folding(grid, n, m)
         # the fine coefficients of an orbit are equal: their mean is each of them
         orbit = np.asarray(fine.sum(axis=0)).ravel()
@@ -126,7 +126,7 @@ def folding(grid: LatticeSplineGrid, n: int, m: int) -> csr_matrix:
     return csr_matrix((ones, (np.arange(n * m), rows)), shape=(n * m, int(rows.max()) + 1))
 
 
-def _periodic_refinement(cells: int) -> csr_matrix:
+def periodic_refinement_along(cells: int) -> csr_matrix:
     """The two-scale relation of quadratic splines along an axis, (2·cells, cells)."""
     coarse = np.arange(cells)
     fine = np.concatenate([(2 * coarse - 1 + k) % (2 * cells) for k in range(4)])
@@ -136,6 +136,12 @@ def _periodic_refinement(cells: int) -> csr_matrix:
 
 def refinement(cells: int, degree: int) -> csr_matrix:
     """From the table of a grid to that of twice as many cells a side, for the same spline."""
+    along = refinement_along(cells, degree)
+    return kron(along, along).tocsr()
+
+
+def refinement_along(cells: int, degree: int = 2) -> csr_matrix:
+    """The two-scale relation along an axis, (2·cells + degree, cells + degree)."""
     coarse = np.arange(cells + degree)
     rows, columns, weights = [], [], []
     for k in range(degree + 2):
@@ -144,8 +150,7 @@ def refinement(cells: int, degree: int) -> csr_matrix:
         rows.append(fine[there])
         columns.append(coarse[there])
         weights.append(np.full(there.sum(), comb(degree + 1, k) / 2**degree))
-    along = csr_matrix(
+    return csr_matrix(
         (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
         shape=(2 * cells + degree, cells + degree),
     )
-    return kron(along, along).tocsr()

@@ -10,7 +10,9 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
-from nsm.instantiation import made, named_object, target_of
+from nsm.instantiation import made, made_with, named_object, target_of
+from nsm.maps import SplineField
+from nsm.tasks.quasi_newton import QuasiNewton
 from nsm.tasks.schedules import scheduled
 
 
@@ -113,6 +115,8 @@ def build_optimizer(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer
     matrices = [key for key, p in named.items() if by_matrix and _hidden_matrix(key, p)]
     others = [p for key, p in named.items() if ".tables." not in key and key not in matrices]
     kind = named_object(rest["_target_"])
+    if kind is QuasiNewton:
+        return _quasi_newton(module, rest)
     if kind is torch.optim.LBFGS:  # takes one group of parameters, and so one learning rate
         others, grids = others + grids, []
     # the names are those of the learning rates in the log
@@ -133,6 +137,20 @@ def build_optimizer(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer
     if kind in (torch.optim.Adam, torch.optim.AdamW, torch.optim.SGD) and not rest.get("foreach"):
         rest.setdefault("fused", True)
     return made(rest, groups)  # type: ignore[no-any-return]
+
+
+def _quasi_newton(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer:
+    fields = [part for part in module.modules() if isinstance(part, SplineField)]
+    trained = [p for p in module.parameters() if p.requires_grad]
+    if len(fields) != len(trained):
+        raise NsmError(
+            "setting optimizer: quasi-Newton steps train splines alone; take map=spline, or "
+            "optimizer=adam_planar for networks",
+            kind="unsuitable_network",
+            key="optimizer",
+        )
+    group = {"params": trained, "name": "spline"}
+    return made_with(settings, params=[group], fields=fields)  # type: ignore[no-any-return]
 
 
 def _hidden_matrix(key: str, p: Tensor) -> bool:

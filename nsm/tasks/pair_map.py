@@ -70,7 +70,8 @@ class PairMap(ConstrainedMap):
         self.phi = phi.eval().requires_grad_(False)
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
-        self.fold_barrier = FoldBarrier(*mesh, margin=self.constraints.fold_margin)
+        held = self.constraints
+        self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
         self.diagonal = diagonal
         self.set_landmarks(points, targets, self.map.before(points), seam)
 
@@ -120,6 +121,7 @@ class PairMap(ConstrainedMap):
             kept = inside(self.domain, h)
             parts = {name: part[kept] for name, part in parts.items()}
         det = torch.linalg.det(jacobian)
+        self.least_determinant = det.detach().min()
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

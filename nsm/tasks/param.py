@@ -60,12 +60,13 @@ class Param(Training):
         super().__init__()
         self.save_hyperparameters(ignore=["domain", "energy", "phi", "mesh"], logger=False)
         self.loss_weights = ParamWeights(**loss_weights)
-        fixed = ParamConstraints(**constraints).boundary == "fixed"
+        held = ParamConstraints(**constraints)
+        fixed = held.boundary == "fixed"
         self.map = planar_map(domain if fixed else None, map, activation, encoding)
         self.energy = as_blend(energy)
         self.loss_terms = made_terms(loss_terms or {})
         self.phi = phi.eval().requires_grad_(False)
-        self.fold_barrier = FoldBarrier(*mesh)
+        self.fold_barrier = FoldBarrier(*mesh, every=held.fold_every)
         self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
@@ -97,6 +98,7 @@ class Param(Training):
         B = first_fundamental_form(jacobian)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         det = torch.linalg.det(jacobian)
+        self.least_determinant = det.detach().min()
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:

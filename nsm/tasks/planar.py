@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from nsm.errors import NsmError
-from nsm.maps import PlanarMap
+from nsm.instantiation import named_object
+from nsm.maps import PlanarMap, SplineField
 from nsm.maps.networks import build_network
 
 
@@ -32,5 +33,7 @@ def planar_map(
     if domain is not None:
         out_dim = domain.network_out_dim
         encoding = domain.encoding(encoding, of_map=True)
+        if not domain.has_boundary and named_object(map.get("_target_", "")) is SplineField:
+            map = {**map, "periodic": True}
     network = build_network(map=map, activation=activation, encoding=encoding, out_dim=out_dim)
     return PlanarMap(network) if domain is None else domain.equivariant(network)

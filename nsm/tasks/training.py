@@ -10,6 +10,7 @@ from torch import Tensor
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.microbatching import Microbatching
 from nsm.tasks.optimizers import configure
+from nsm.tasks.quasi_newton import QuasiNewton
 from nsm.tasks.terms import Term
 
 
@@ -22,6 +23,7 @@ class Training(Microbatching):
         progress_figure, progress_form: the logged figure beside the progress bar, and its format.
         log_every: steps between two logged values; logging each step would take Lightning as long
             as the network takes for its work.
+        least_determinant: of J_h at the samples of the last evaluation; None: h has none.
         compiled: calls evaluations of a training step in compiled form; None: uncompiled.
     """
 
@@ -32,6 +34,7 @@ class Training(Microbatching):
     loss_terms: Any  # ModuleDict of nsm.tasks.terms.LossTerm
     log_every = 1
     compiled: Compiled | None = None
+    least_determinant: Tensor | None = None
 
     def pointwise(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
@@ -68,4 +71,7 @@ class Training(Microbatching):
         self.log_dict(dict(figures), batch_size=batch_size)
 
     def configure_optimizers(self) -> Any:
-        return configure(self.map, self.hparams)
+        configured = configure(self.map, self.hparams)
+        if isinstance(configured["optimizer"], QuasiNewton):
+            configured["optimizer"].watch(lambda: self.least_determinant)
+        return configured

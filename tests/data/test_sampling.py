@@ -12,6 +12,7 @@ from tiny import dome
 
 from nsm.data import CollectionData, Sampler, SurfaceData, SurfaceSampler
 from nsm.domains import Surface
+from nsm.maps import Rotated
 from nsm.surfaces.location import locate
 
 
@@ -177,7 +178,7 @@ def test_a_users_own_sampler_needs_one_method():
     assert torch.equal(data.batch(3).points, data.points.vertices[:8])
     shared = CollectionData(
         [DOME] * 3,
-        torch.eye(2).expand(3, 2, 2),
+        [Rotated(torch.nn.Identity(), torch.eye(2))] * 3,
         Corners(),
         batch_size=9,
         steps_per_epoch=1,

@@ -25,17 +25,17 @@ def meshes():
     ]
 
 
-def answers(monkeypatch, margin, energy=5.0):
+def answers(monkeypatch, margin, score=2.0):
     """Let the search answer with two hypotheses, in the numbers of cleaned meshes."""
     found = [
-        Hypothesis(np.array([[k, 10 + k] for k in range(first, first + 4)]), s, energy, 0, 0, None)
-        for first, s in ((0, 2.0), (20, 2.0 + margin))
+        Hypothesis(np.array([[k, 10 + k] for k in range(first, first + 4)]), s, 5.0, 0, 0, None)
+        for first, s in ((0, score), (20, score + margin))
     ]
     monkeypatch.setattr(proposed_landmarks, "proposed", lambda *_: Proposal(found, margin))
 
 
-def proposed_with(margin, monkeypatch, strict=False, alternative=0, energy=5.0):
-    answers(monkeypatch, margin, energy)
+def proposed_with(margin, monkeypatch, strict=False, alternative=0, score=2.0):
+    answers(monkeypatch, margin, score)
     console = Console(record=True, width=300)
     return propose_landmarks(meshes(), strict, alternative, console), console.export_text()
 
@@ -51,11 +51,11 @@ def test_a_sure_proposal_is_taken_in_the_numbers_of_the_files(monkeypatch, tmp_p
 
 
 def test_an_unsure_one_is_a_warning_or_an_error(monkeypatch):
-    for margin, energy in ((0.01, 5.0), (0.5, 30.0)):
-        _, said = proposed_with(margin, monkeypatch, energy=energy)
+    for margin, score in ((0.01, 2.0), (0.5, 3.5)):
+        _, said = proposed_with(margin, monkeypatch, score=score)
         assert "WARNING" in said
         with pytest.raises(NsmError) as refused:
-            proposed_with(margin, monkeypatch, strict=True, energy=energy)
+            proposed_with(margin, monkeypatch, strict=True, score=score)
         assert (refused.value.kind, refused.value.key) == ("unsure_landmarks", "proposal.strict")
     proposed_with(0.5, monkeypatch, strict=True)
 

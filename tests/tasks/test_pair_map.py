@@ -7,7 +7,7 @@ import torch
 from nsm.data import Samples
 from nsm.domains import Disc
 from nsm.energies import SymmetricDirichlet
-from nsm.maps import build_analytic
+from nsm.maps import Rotated, build_analytic
 from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks import CollectionMap, PairMap
 from nsm.tasks import fold_barrier as fold_barrier_module
@@ -64,6 +64,10 @@ def quiet(kind):
     return make
 
 
+def start(rotation):
+    return Rotated(torch.nn.Identity(), rotation)
+
+
 def pair(phi, psi, points=NONE, targets=NONE, rotation=None, **changes):
     torch.manual_seed(0)
     return quiet(PairMap)(
@@ -71,7 +75,7 @@ def pair(phi, psi, points=NONE, targets=NONE, rotation=None, **changes):
         points=points,
         targets=targets,
         seam=torch.zeros(0, 2, 2),
-        rotation=torch.eye(2) if rotation is None else rotation,
+        start=start(torch.eye(2) if rotation is None else rotation),
         mesh=MESH,
         diagonal=1.0,
         phi=phi,
@@ -214,7 +218,7 @@ def test_the_seam_term_draws_both_copies_together():
         points=NONE,
         targets=NONE,
         seam=seam,
-        rotation=torch.eye(2),
+        start=start(torch.eye(2)),
         mesh=MESH,
         diagonal=1.0,
         phi=surface("plane"),
@@ -241,7 +245,7 @@ def collection(names, points=NONE, targets=None, seam=None, **changes):
         points=points,
         targets=torch.zeros(k, 0, 2) if targets is None else targets,
         seam=torch.zeros(0, 2, 2) if seam is None else seam,
-        rotations=torch.eye(2).expand(k, 2, 2),
+        starts=[start(torch.eye(2))] * k,
         mesh=MESH,
         diagonals=[1.0] * k,
         phis=[surface(n) for n in names],

@@ -283,6 +283,21 @@ def serving(result: Result, host: str, port: int) -> Iterator[tuple[Viewer, str]
 
     Args:
         result: from :func:`nsm.load`.
+        host, port: as for :func:`running`.
+
+    Raises:
+        NsmError: as :func:`running`.
+    """
+    with running("nsm view", host, port) as (server, address):
+        yield Viewer(result, server), address
+
+
+@contextlib.contextmanager
+def running(command: str, host: str, port: int) -> Iterator[tuple[Any, str]]:
+    """A ``viser.ViserServer`` until the block ends, and its address.
+
+    Args:
+        command: that needs it, for messages.
         host: the address to listen on.
         port: 0 for any free port.
 
@@ -290,7 +305,7 @@ def serving(result: Result, host: str, port: int) -> Iterator[tuple[Viewer, str]
         NsmError: viser is not installed, ``out_of_range`` or ``port_in_use`` (key ``port``), or
             ``address_not_available`` (key ``host``).
     """
-    viser = needed("viser", "nsm view", "view")
+    viser = needed("viser", command, "view")
     _check_address(host, port)
     with _silenced():
         server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -301,7 +316,7 @@ def serving(result: Result, host: str, port: int) -> Iterator[tuple[Viewer, str]
         if port not in (0, bound):  # another process took it after the check
             raise _in_use(port)
         name = f"[{host}]" if ":" in host else host
-        yield Viewer(result, server), f"http://{name}:{bound}"
+        yield server, f"http://{name}:{bound}"
     finally:
         with _silenced():
             server.stop()

@@ -1,0 +1,63 @@
+"""One fixed batch for each level of a training that goes from coarse to fine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+
+from nsm.data.sampler import Draws
+from nsm.data.sampling import Samples
+from nsm.data.surface import SurfaceData
+from nsm.domains import Surface
+from nsm.settings import Count
+
+
+class LevelData(SurfaceData):
+    """Samples of a surface that stay the same during a level: a fixed quadrature.
+
+    Args:
+        surface: the prepared surface.
+        sampler: draws the training samples (see :class:`nsm.data.Sampler`).
+        points: in the batch of each level.
+        steps: of each level but the last, which lasts until the end.
+        steps_per_epoch, held_out, seed: as for :class:`nsm.data.SurfaceData`.
+
+    Raises:
+        ValueError: as many ``steps`` as ``points``, or more; or fewer by two.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        sampler: Draws | None = None,
+        *,
+        points: Sequence[int],
+        steps: Sequence[int],
+        steps_per_epoch: Count = 250,
+        held_out: Count = 16_384,
+        seed: int = 0,
+    ) -> None:
+        if len(steps) != len(points) - 1 or min(points, default=0) < 1 or min(steps, default=0) < 0:
+            raise ValueError(
+                "data.points has one number, 1 or more, per level; data.steps one, 0 or more, per "
+                "level but the last"
+            )
+        super().__init__(
+            surface,
+            sampler,
+            batch_size=points[-1],
+            steps_per_epoch=steps_per_epoch,
+            held_out=held_out,
+            seed=seed,
+        )
+        self.counts, self.ends = list(points), list(accumulate(steps))
+        self._drawn: tuple[int, Samples] | None = None
+
+    def batch(self, step: int) -> Samples:
+        """The samples of a step's level; of several processes, this one's share of them."""
+        level = sum(step >= end for end in self.ends)
+        if self._drawn is None or self._drawn[0] != level:
+            generator = self.points.generator(self.seed, level)
+            whole = self.own_sampler.draw(self.points, self.counts[level], generator)
+            self._drawn = level, Samples(*(self.part.of_rows(rows) for rows in whole))
+        return self._drawn[1]

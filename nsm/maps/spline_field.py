@@ -1,0 +1,166 @@
+"""A planar spline whose coefficients are all that it has: what quasi-Newton steps train."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from nsm.instantiation import target_of
+from nsm.maps.encodings import _bspline, transformed
+
+_DEGREE = 2
+_TAPS = (_DEGREE + 1) ** 2
+_KEPT = 8  # sets of points whose weights are kept
+_MOST = 1 << 17  # larger sets are not kept
+
+
+class _Weights:
+    """What a set of points sees of the coefficients: value and both tangents are a matrix product
+    with them, W c, and the gradient is the transposed product, both as sums over short rows.
+
+    Args:
+        x: the points (N, 2).
+        rows: (N, 9) of the coefficients.
+        weights: (P, N, 9), of the value and perhaps the tangents.
+        count: of all rows.
+    """
+
+    def __init__(self, x: Tensor, rows: Tensor, weights: Tensor, count: int) -> None:
+        self.x, self.planes = x, len(weights)
+        self.rows = rows.repeat(len(weights), 1)
+        self.weights = weights.flatten(0, 1)
+        place, order = self.rows.flatten().sort(stable=True)
+        self.of = order // _TAPS  # the entry of W c that each weight belongs to
+        self.turned = self.weights.flatten()[order]
+        self.starts = torch.searchsorted(place, torch.arange(count, device=x.device))
+
+
+class _Product(torch.autograd.Function):
+    """W c, whose gradient by c is the product with the transposed matrix."""
+
+    @staticmethod
+    def forward(ctx: Any, coefficients: Tensor, weights: _Weights) -> Tensor:
+        """(rows, d) to (P · N, d)."""
+        ctx.of = weights
+        return _sums(coefficients, weights.rows, weights.weights)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        w = ctx.of
+        return _sums(gradient.contiguous(), w.of, w.turned, w.starts), None
+
+
+def _sums(table: Tensor, rows: Tensor, weights: Tensor, starts: Tensor | None = None) -> Tensor:
+    return nn.functional.embedding_bag(
+        rows, table, offsets=starts, mode="sum", per_sample_weights=weights
+    )
+
+
+class SplineField(nn.Module):
+    """One uniform quadratic B-spline on [-1, 1]²: linear in its coefficients, zero at the start.
+
+    Weights of points that come again, as those of a fixed quadrature do, are kept.
+
+    Args:
+        out_dim: of the values.
+        cells: along each axis.
+        periodic: on the torus R²/(2Z)²; else points outside the square count as the nearest in it.
+
+    Attributes:
+        coefficients: (side², ``out_dim``), side = cells + 2, or cells if periodic.
+
+    Raises:
+        ValueError: a parameter is out of range.
+    """
+
+    def __init__(self, out_dim: int = 2, cells: int = 8, periodic: bool = False) -> None:
+        super().__init__()
+        if out_dim < 1 or cells < 3:
+            raise ValueError("map.cells must be 3 or more, and out_dim positive")
+        self.periodic, self.out_dim = bool(periodic), int(out_dim)
+        side = cells if periodic else cells + _DEGREE
+        self.coefficients = nn.Parameter(torch.zeros(side * side, out_dim))
+        self._recent: list[_Weights] = []
+
+    @property
+    def side(self) -> int:
+        """Coefficients along each axis."""
+        return round(len(self.coefficients) ** 0.5)
+
+    @property
+    def cells(self) -> int:
+        """Cells along each axis."""
+        return self.side if self.periodic else self.side - _DEGREE
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Settings from which :func:`nsm.maps.build_stored` makes it again."""
+        return {
+            "_target_": target_of(type(self)).replace("nsm.maps.spline_field.", "nsm.maps."),
+            "out_dim": self.out_dim,
+            "cells": self.cells,
+            "periodic": self.periodic,
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_recent": []}
+
+    def _seen(self, x: Tensor, tangents: bool) -> tuple[Tensor, Tensor]:
+        """Rows (N, 9) of the coefficients that points see, and their weights (P, N, 9)."""
+        cells = self.cells
+        z = (x.t() + 1) * (0.5 * cells)
+        cell = z.detach().floor()
+        if not self.periodic:
+            cell = cell.clamp(0, cells - 1)
+        free = z - cell
+        offset = free.clamp(0, 1)
+        w, slopes, _ = (torch.stack(order, dim=-1) for order in _bspline(offset, _DEGREE))
+        along = cell.long()[..., None] + torch.arange(_DEGREE + 1, device=x.device)
+        if self.periodic:
+            along = (along - 1).remainder(cells)
+        rows = along[0, :, :, None] * self.side + along[1, :, None, :]
+        orders = [(w[0], w[1])]
+        if tangents:  # beyond the rim nothing changes
+            d = slopes * ((offset == free) * (0.5 * cells))[..., None]
+            orders += [(d[0], w[1]), (w[0], d[1])]
+        weights = torch.stack([u[:, :, None] * v[:, None, :] for u, v in orders])
+        return rows.flatten(1), weights.flatten(2)
+
+    def _evaluated(self, x: Tensor, tangents: bool) -> Tensor:
+        """Value and perhaps both tangents at points (..., 2): (P, ..., out_dim)."""
+        points = x.reshape(-1, 2).to(self.coefficients.dtype)
+        planes = 3 if tangents else 1
+        if points.requires_grad or transformed() or torch.compiler.is_compiling():
+            rows, weights = self._seen(points, tangents)
+            out = (weights[..., None] * self.coefficients[rows]).sum(dim=-2)
+        elif torch.is_grad_enabled() and self.coefficients.requires_grad:
+            out = _Product.apply(self.coefficients, self._weights(points, tangents))
+        else:
+            rows, weights = self._seen(points, tangents)
+            out = _sums(self.coefficients, rows.repeat(planes, 1), weights.flatten(0, 1))
+        return out.view(planes, *x.shape[:-1], self.out_dim)
+
+    def _weights(self, x: Tensor, tangents: bool) -> _Weights:
+        """The weights of points (N, 2), kept if they were asked for before."""
+        planes = 3 if tangents else 1
+        for at, known in enumerate(self._recent):
+            if known.planes == planes and known.x.device == x.device and torch.equal(known.x, x):
+                self._recent.append(self._recent.pop(at))
+                return known
+        made = _Weights(x.clone(), *self._seen(x, tangents), len(self.coefficients))
+        if len(x) <= _MOST:
+            self._recent = [*self._recent[1 - _KEPT :], made]
+        return made
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Points (..., 2) to values (..., out_dim)."""
+        return self._evaluated(x, tangents=False)[0]
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (..., 2) to values (..., out_dim) and Jacobians (..., out_dim, 2)."""
+        stack = self._evaluated(x, tangents=True)
+        return stack[0], torch.stack([stack[1], stack[2]], dim=-1)
