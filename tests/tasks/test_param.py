@@ -2,6 +2,7 @@
 
 import json
 
+import ezdxf
 import numpy as np
 import pytest
 import torch
@@ -159,6 +160,10 @@ def test_parameterize_lowers_distortion_and_is_given_back(phi, tmp_path):
     )
     for name in ("parameterized.obj", "parameterized.glb", "checkerboard.png", "map.safetensors"):
         assert (tmp_path / name).stat().st_size > 0
+    # the pattern is in file units: half a unit sphere has the area 2π, and Ω has π
+    (outline,) = ezdxf.readfile(tmp_path / "pattern.dxf").modelspace().query("LWPOLYLINE")
+    x, y = np.array(outline.get_points("xy")).T
+    assert 0.9 < 0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)) / (2 * np.pi) < 1.2
     stored = json.loads((tmp_path / "metrics.json").read_text())
     assert stored["metrics"] == flat.metrics
     again = nsm.load(tmp_path)
