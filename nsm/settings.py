@@ -200,6 +200,10 @@ class SurfaceSettings:
             chosen.
         cones: for domain=orbifold, four vertices, by their numbers in the file, at its cones; null:
             chosen.
+        parts: of a mesh of several connected components: largest, or a number, counted from 0 by
+            falling area, says which is kept; null: small ones are removed, others refused.
+        repair: split cuts a mesh apart at non-manifold edges (three faces or more); null: it is
+            refused.
         parameterization: of the mesh over Ω: slim (low distortion) or tutte.
         cache: keep the prepared surface on disk, under a hash of its content.
     """
@@ -208,6 +212,8 @@ class SurfaceSettings:
     name: str = "terrain"
     seam_vertices: list[int] | None = None
     cones: list[int] | None = None
+    parts: Literal["largest"] | Whole | None = None
+    repair: Literal["split"] | None = None
     parameterization: Literal["slim", "tutte"] = "slim"
     cache: bool = True
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from nsm.errors import NsmError
 from nsm.stages import counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
-from nsm.surfaces.validation import CleanMesh, clean
+from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ def prepare_jointly(
     seam: str = "auto",
     seam_landmarks: int | None = None,
     cache: bool = True,
+    repairs: Repairs = NO_DECISION,
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
@@ -53,7 +54,7 @@ def prepare_jointly(
     Args:
         meshes: two or more.
         landmarks: (L,) vertices of each, in the same order.
-        domain, parameterization, cache: as for :meth:`Surface.load`.
+        domain, parameterization, cache, repairs: as for :meth:`Surface.load`.
         seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
             ``auto``, which tries both and keeps the seam for which the domains agree best; or
             ``own``: each mesh is cut by itself.
@@ -65,7 +66,7 @@ def prepare_jointly(
             loops differ; ``no_common_seam``.
     """
     domain = domain_of(domain)
-    cleaned = [clean(m.vertices, m.faces, m.name) for m in meshes]
+    cleaned = [clean(m.vertices, m.faces, m.name, repairs) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
     enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
     apart = seam == "own" and domain.has_boundary
@@ -79,6 +80,7 @@ def prepare_jointly(
                 parameterization=parameterization,
                 cache=cache,
                 log=m.log,
+                repairs=repairs,
             )
             for m in counted("layout on the domain", meshes)
         ]
@@ -91,6 +93,7 @@ def prepare_jointly(
         "domain": stored_domain(domain),
         "method": parameterization,
         "seam": [seam, seam_landmarks],
+        "repairs": asdict(repairs),
     }
     # keys of the files: meshes that are equal once cleaned may still differ in vertex numbers
     names = [cache_.preparation_key(m.vertices, m.faces, options) for m in meshes]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays
-from nsm.surfaces.validation import CleanMesh, clean
+from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 OPTIONAL = ("lattice",)
@@ -81,6 +81,7 @@ class Surface:
         cones: Sequence[int] | None = None,
         parameterization: str = "slim",
         cache: bool = True,
+        repairs: Repairs = NO_DECISION,
     ) -> Surface:
         """Load a mesh file, or a mesh of the catalogue by name, and prepare it.
 
@@ -95,6 +96,7 @@ class Surface:
                 surface is least distorted.
             parameterization: ``slim`` or ``tutte``; closed domains have ``slim`` only.
             cache: keep the prepared surface on disk, keyed by content.
+            repairs: decisions on a mesh that is not one manifold.
 
         Raises:
             NsmError: no such file or name, or a mesh that cannot be prepared.
@@ -110,6 +112,7 @@ class Surface:
             parameterization=parameterization,
             cache=cache,
             log=mesh.log,
+            repairs=repairs,
         )
 
     @classmethod
@@ -125,6 +128,7 @@ class Surface:
         parameterization: str = "slim",
         cache: bool = False,
         log: Sequence[str] = (),
+        repairs: Repairs = NO_DECISION,
     ) -> Surface:
         """Validate, cut, normalise and parameterise a mesh (V, 3), (F, 3).
 
@@ -155,12 +159,14 @@ class Surface:
         options = {"domain": stored_domain(domain), "seam": seam, "method": parameterization}
         if corners is not None:
             options["cones"] = corners
+        if repairs != NO_DECISION:
+            options["repairs"] = asdict(repairs)
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         raw = (vertices, faces)
         if stored is not None:
             return replace(cls.from_stored(name, domain, stored), raw=raw)
-        mesh = clean(vertices, faces, name)
+        mesh = clean(vertices, faces, name, repairs)
         about: dict[str, Any] = {
             "name": name,
             "domain": domain,

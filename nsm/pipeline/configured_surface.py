@@ -11,12 +11,18 @@ from rich.console import Console
 
 from nsm.domains import Surface, domain
 from nsm.stages import stage
+from nsm.surfaces.validation import Repairs
 
 
 def keep_absolute(config: DictConfig) -> None:
     """Make the path of the group ``surface`` absolute, to resume the run from any folder."""
     if config.surface.path is not None:
         config.surface.path = os.path.abspath(config.surface.path)
+
+
+def configured_repairs(config: DictConfig) -> Repairs:
+    """The decisions of the group ``surface`` on meshes; older run folders have none."""
+    return Repairs(config.surface.get("parts"), config.surface.get("repair"))
 
 
 def configured_surface(config: DictConfig, console: Console, given: Any = None) -> Surface:
@@ -43,6 +49,7 @@ def configured_surface(config: DictConfig, console: Console, given: Any = None) 
             cones=settings.get("cones"),  # absent in older run folders
             parameterization=settings.parameterization,
             cache=settings.cache,
+            repairs=configured_repairs(config),
         )
 
 

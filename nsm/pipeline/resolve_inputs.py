@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Domain, Surface, domain
-from nsm.domains.joint_preparation import Mesh, prepare_jointly
+from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_jointly
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC
-from nsm.pipeline.configured_surface import report_surface
+from nsm.pipeline.configured_surface import configured_repairs, report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.results.analytic import lies_over
@@ -256,6 +256,24 @@ def _vertices(given: Landmarks, shape: Shape) -> tuple[AtVertices, float]:
     return found._replace(vertex=surface.source_vertex[known[found.vertex]]), diagonal
 
 
+def _check_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray]) -> None:
+    """NsmError for meshes that the landmarks do not put into correspondence, before the networks
+    are trained."""
+    try:
+        matched_landmarks(surfaces, landmarks)
+    except NsmError as error:
+        if error.kind != "no_common_seam":
+            raise
+        names = " and ".join(surface.name for surface in surfaces)
+        raise NsmError(
+            f"{names}: their boundaries, or the cuts between them, pass the landmarks differently, "
+            "so that no map takes one to the other; leave out the landmarks on boundaries and "
+            "cuts, or close the holes in a mesh editor",
+            kind=error.kind,
+            key=error.key,
+        ) from error
+
+
 def neural_surfaces(
     config: DictConfig, shapes: Sequence[Shape], landmarks: Sequence[np.ndarray], console: Console
 ) -> list[NeuralSurface]:
@@ -277,7 +295,10 @@ def neural_surfaces(
                 seam=config.seam.path,
                 seam_landmarks=config.seam.landmarks,
                 cache=config.surface.cache,
+                repairs=configured_repairs(config),
             )
+        if not ready:
+            _check_landmarks(prepared, landmarks)
         for surface in prepared:
             report_surface(console, surface)
         ready.update(zip(meshes, cached_surfaces(prepared, config, console), strict=True))

@@ -1,12 +1,14 @@
 """Turn a mesh into a clean oriented manifold, or refuse it.
 
-Only repairs that keep the shape are made, and each is logged. A mesh that needs a decision (several
-connected components, non-manifold edges, a non-orientable surface) is refused.
+Only repairs that keep the shape are made, and each is logged. A mesh that needs a decision is
+refused: of several connected components, and on non-manifold edges, the user decides by
+:class:`Repairs`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -32,6 +34,23 @@ LARGEST, SMALLEST = 1e30, 1e-30
 
 
 @dataclass(frozen=True)
+class Repairs:
+    """Decisions on a mesh that is not one manifold.
+
+    Attributes:
+        parts: which connected component is kept: the largest, or that of a number, counted from 0
+            by falling area; None: small ones are removed, and others refused.
+        repair: split: the mesh is cut apart at non-manifold edges; None: they are refused.
+    """
+
+    parts: Literal["largest"] | int | None = None
+    repair: Literal["split"] | None = None
+
+
+NO_DECISION = Repairs()
+
+
+@dataclass(frozen=True)
 class CleanMesh:
     """An oriented, connected manifold mesh.
 
@@ -50,13 +69,16 @@ class CleanMesh:
     log: tuple[str, ...]
 
 
-def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanMesh:
+def clean(
+    vertices: np.ndarray, faces: np.ndarray, name: str = "mesh", repairs: Repairs = NO_DECISION
+) -> CleanMesh:
     """Make all repairs that keep the shape.
 
     Args:
         vertices: (W, 3).
         faces: (G, 3).
         name: the key of errors.
+        repairs: what the user decides.
 
     Raises:
         NsmError: ``non_manifold``, ``disconnected``, ``not_orientable``, ``degenerate``,
@@ -73,23 +95,21 @@ def clean(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> CleanM
     if unreferenced:
         log.append(f"{unreferenced} unreferenced vertices removed")
     faces = _remove_degenerate(vertices, representative[faces], name, log)
-    edges = topology.edges_of(faces)
-    if edges.count.max() > 2:
-        a, b = edges.pairs[int(edges.count.argmax())]
-        count = int((edges.count > 2).sum())
-        where = f"{count} non-manifold edges (three or more faces), such as {a}-{b}"
-        raise error_in(name, "non_manifold", f"{where}; remove inner faces in a mesh editor")
-    faces = _keep_largest_component(vertices, faces, name, log)
+    of_vertex = np.arange(len(vertices))
+    if topology.edges_of(faces).count.max() > 2:
+        faces, of_vertex = _split_edges(faces, name, repairs, log)
+    faces = _keep_component(vertices[of_vertex], faces, name, repairs, log)
     faces = _orient(faces, name, log)
 
     split_faces, old = topology.cut_along(
         faces, np.zeros(len(topology.edges_of(faces).pairs), dtype=bool)
     )
     used = len(np.unique(faces))
+    old = of_vertex[old]
     if len(old) > used:
         log.append(f"{len(old) - used} non-manifold vertices split")
         # components that were connected only by such a vertex are separate now
-        split_faces = _keep_largest_component(vertices[old], split_faces, name, log)
+        split_faces = _keep_component(vertices[old], split_faces, name, repairs, log)
         kept = np.unique(split_faces)
         split_faces = np.searchsorted(kept, split_faces)
         old = old[kept]
@@ -289,21 +309,49 @@ def _sides(face: list[int]) -> list[tuple[int, int]]:
     return [(min(a, b), max(a, b)), (min(b, c), max(b, c)), (min(c, a), max(c, a))]
 
 
-def _keep_largest_component(
-    vertices: np.ndarray, faces: np.ndarray, name: str, log: list[str]
+def _split_edges(
+    faces: np.ndarray, name: str, repairs: Repairs, log: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Faces (F, 3) cut apart at edges of three faces or more, and the vertex (V,) that each new
+    one is a copy of."""
+    edges = topology.edges_of(faces)
+    count = int((edges.count > 2).sum())
+    if repairs.repair is None:
+        a, b = edges.pairs[int(edges.count.argmax())]
+        where = f"{count} non-manifold edges (three or more faces), such as {a}-{b}"
+        reason = f"{where}; surface.repair=split cuts them apart, or remove inner faces yourself"
+        raise error_in(name, "non_manifold", reason)
+    log.append(f"cut apart at {count} non-manifold edges")
+    # a fan of faces around a copy ends at cut edges, so that at most two faces share each of them
+    return topology.cut_along(faces, edges.count > 2)
+
+
+def _keep_component(
+    vertices: np.ndarray, faces: np.ndarray, name: str, repairs: Repairs, log: list[str]
 ) -> np.ndarray:
+    """The faces of the component that is chosen, or of the largest beside small ones."""
     label = topology.face_components(faces)
     count = int(label.max()) + 1
     if count == 1:
         return faces
     share = np.bincount(label, weights=topology.face_areas(vertices, faces))
     share = share / share.sum()
-    largest = int(share.argmax())
+    order = np.argsort(-share, kind="stable")
+    if repairs.parts is not None:
+        number = 0 if repairs.parts == "largest" else int(repairs.parts)
+        if not 0 <= number < count:
+            reason = f"surface.parts={number}: there are {count}; give 0 to {count - 1}, or largest"
+            raise error_in(name, "out_of_range", reason)
+        part = int(order[number])
+        log.append(f"1 of {count} connected components kept, {100 * share[part]:.2f} % of the area")
+        return faces[label == part]
+    largest = int(order[0])
     others = np.delete(share, largest)
     if others.max() >= DROPPED_SHARE or others.sum() >= DROPPED_TOTAL:
         listed = ", ".join(f"{100 * s:.1f} %" for s in np.sort(share)[::-1][:6])
         where = f"{count} connected components ({listed} of the area)"
-        raise error_in(name, "disconnected", f"{where}; keep one, or join them, in a mesh editor")
+        reason = f"{where}; keep one with surface.parts=largest, or surface.parts=1 and so on"
+        raise error_in(name, "disconnected", reason)
     dropped = 100 * others.sum()
     log.append(f"{count - 1} small connected components removed ({dropped:.2f} % of the area)")
     return faces[label == largest]

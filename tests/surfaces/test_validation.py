@@ -7,7 +7,7 @@ import trimesh
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
-from nsm.surfaces.validation import clean
+from nsm.surfaces.validation import Repairs, clean
 
 TETRAHEDRON = (
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
@@ -192,3 +192,56 @@ def test_neighbours_at_one_place_are_welded_without_a_hole():
     assert topology.euler_characteristic(mesh.faces) == 2
     assert topology.boundary_loops(mesh.faces) == []
     assert mesh.merged[twin] == mesh.merged[corner]
+
+
+def two_balls() -> tuple[np.ndarray, np.ndarray]:
+    """A ball of radius 2, after one of radius 1."""
+    vertices, faces = ball()
+    return np.vstack([vertices, 2 * vertices + 9]), np.vstack([faces, faces + len(vertices)])
+
+
+@pytest.mark.parametrize(("parts", "first"), [("largest", True), (0, True), (1, False)])
+def test_the_component_that_the_user_chooses_is_kept(parts, first):
+    vertices, faces = two_balls()
+    half = len(vertices) // 2
+    mesh = clean(vertices, faces, repairs=Repairs(parts=parts))
+    assert np.array_equal(mesh.source_vertex >= half, np.full(half, first))
+    assert np.array_equal(mesh.vertices, vertices[mesh.source_vertex])
+    assert (mesh.merged[:half] < 0).all() == first
+
+
+def test_a_component_that_is_not_there_is_refused():
+    with pytest.raises(NsmError) as caught:
+        clean(*two_balls(), "scan", Repairs(parts=2))
+    assert (caught.value.kind, caught.value.key) == ("out_of_range", "scan")
+
+
+def test_a_fin_is_cut_off_and_the_rest_is_as_it_was():
+    mesh = clean(*fin(), repairs=Repairs("largest", "split"))
+    alone = clean(*TETRAHEDRON)
+    assert np.array_equal(mesh.source_vertex[mesh.faces], alone.source_vertex[alone.faces])
+
+
+def walled_tube(n: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """A square tube with a wall from one of its long edges to the opposite one."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+    z = np.arange(n, dtype=float)
+    vertices = np.array([[x, y, h] for h in z for x, y in corners])
+    faces = []
+    for k in range(n - 1):
+        for a, b in ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2)):
+            p, q, r, s = 4 * k + a, 4 * k + b, 4 * k + 4 + b, 4 * k + 4 + a
+            faces += [(p, q, r), (p, r, s)]
+    return vertices, np.array(faces)
+
+
+def test_walls_are_cut_off_at_their_edges():
+    vertices, faces = walled_tube()
+    with pytest.raises(NsmError) as caught:
+        clean(vertices, faces)
+    assert caught.value.kind == "non_manifold"
+    mesh = clean(vertices, faces, repairs=Repairs(0, "split"))
+    assert topology.edges_of(mesh.faces).count.max() == 2
+    assert np.array_equal(mesh.vertices, vertices[mesh.source_vertex])
+    assert topology.is_disc(mesh.faces)
+    assert topology.face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(10)
