@@ -387,6 +387,7 @@ def test_surfaces_of_any_few_triangles(vertices, faces):
 )
 def test_seams_preimages_and_choices(numbers, domain, method):
     s = NEURAL[0].surface
+    np.testing.assert_allclose(s.at(s.uv), s.vertices, atol=1e-9)
     try:
         assert s.preimages(numbers).shape == (len(numbers), 2)
         assert set(s.kept(numbers)) <= set(s.source_vertex)
@@ -649,6 +650,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "Surface.from_cut": [test_surfaces_of_any_few_triangles],
     "Surface.from_stored": [test_surfaces_of_any_few_triangles],
     "Surface.to_stored": [test_surfaces_of_any_few_triangles],
+    "Surface.at": [test_seams_preimages_and_choices],
     "Surface.content_key": [test_surfaces_of_any_few_triangles],
     "Surface.kept": [test_seams_preimages_and_choices],
     "Surface.load": [test_unknown_names_are_refused],

@@ -19,6 +19,8 @@ import nsm
 from nsm.pipeline.folder_lock import LOCK_FILE
 
 # largest RMS distance of φ from the mesh after the few steps of a case, in percent of the diagonal
+# Euler characteristics of closed domains
+CLOSED = {"orbifold": 2, "torus": 0}
 NEAR_PERCENT = 15.0
 _ROUNDING = 1e-9
 # for maps, whose networks compute in single precision
@@ -114,9 +116,14 @@ def _surface(folder: Path, mesh: tuple[np.ndarray, np.ndarray] | None) -> Iterat
     metadata = json.loads((folder / "surface.json").read_text())
     about, analytic = metadata["surface"], "width" not in metadata["map"]
     faces, uv, vertices = (arrays[f"surface.{key}"] for key in ("faces", "uv", "vertices"))
-    area = math.pi if about["domain"] == "disc" else 4.0
-    yield from disc(faces)
-    yield from injective(faces, uv, about["domain"])
+    area = 4.0 if about["domain"] == "square" else math.pi
+    if about["domain"] in CLOSED:
+        pairs = arrays["surface.seam_pairs"]
+        yield from closed(faces, pairs, about["domain"])
+        yield from covering(faces, uv, pairs, about["domain"])
+    else:
+        yield from disc(faces)
+        yield from injective(faces, uv, about["domain"])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     total = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     # triangles inscribed in an analytic surface have a smaller area
@@ -146,6 +153,42 @@ def disc(faces: np.ndarray) -> Iterator[str]:
         yield "more than one connected component"
     if boundary(faces) is None:
         yield "its boundary is not one loop"
+
+
+def closed(faces: np.ndarray, pairs: np.ndarray, domain: str) -> Iterator[str]:
+    """Complaints unless the mesh with its copies as one is closed, oriented and of Ω's genus."""
+    first = np.arange(faces.max() + 1)
+    first[pairs[:, 1]] = pairs[:, 0]
+    whole = first[faces]
+    directed = whole[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = np.unique(directed, axis=0)
+    if len(edges) != len(directed) or len(np.unique(np.sort(edges, axis=1), axis=0)) * 2 != len(
+        edges
+    ):
+        yield "it is not closed and oriented"
+        return
+    euler = len(np.unique(whole)) - len(edges) // 2 + len(whole)
+    if euler != CLOSED[domain]:
+        yield f"Euler characteristic {euler}, not that of the {domain}"
+
+
+def covering(faces: np.ndarray, uv: np.ndarray, pairs: np.ndarray, domain: str) -> Iterator[str]:
+    """Complaints unless uv maps a closed mesh homeomorphically onto Ω = R²/Γ.
+
+    It does if all triangles are counter-clockwise, their areas add up to that of Ω, and copies of a
+    vertex are equal modulo Γ: translations by even integers and, on the orbifold, x ↦ -x.
+    """
+    folded = _folded(faces, uv)
+    if folded:
+        yield f"{folded} triangles of the domain are folded"
+    total = _double_areas(*(uv[faces[:, k]] for k in range(3))).sum() / 2
+    if not math.isclose(total, 2.0 if domain == "orbifold" else 4.0, rel_tol=1e-9):
+        yield f"the domain is covered with the area {total}"
+    a, b = uv[pairs[:, 0]], uv[pairs[:, 1]]
+    off = [np.abs((b - s * a) / 2 - np.rint((b - s * a) / 2)).max(axis=1) for s in (1, -1)]
+    apart = off[0] if domain == "torus" else np.minimum(*off)
+    if (apart > 1e-9).any():
+        yield "copies of a vertex are different points of the domain"
 
 
 def boundary(faces: np.ndarray) -> np.ndarray | None:
@@ -213,6 +256,9 @@ def _reconstruction(folder: Path) -> Iterator[str]:
     phi = nsm.load(folder)
     arrays = load_file(folder / "surface.safetensors")
     points, vertices = phi(arrays["surface.uv"]), arrays["surface.vertices"]
+    if phi.surface.domain.name in CLOSED:  # written with the vertices of the file
+        first, _ = phi.surface.whole()
+        points, vertices = points[first], vertices[first]
     diagonal = np.linalg.norm(np.ptp(vertices, axis=0))
     off = 100 * math.sqrt(((points - vertices) ** 2).sum(axis=1).mean()) / diagonal
     if not off < NEAR_PERCENT:
@@ -236,9 +282,15 @@ def _map(folder: Path, task: str) -> Iterator[str]:
     domain = json.loads((source / "surface.json").read_text())["surface"]["domain"]
     result = nsm.load(folder)
     image = result.uv if task == "param" else result.image_uv
-    found = list(injective(faces, image, domain, _SINGLE))
+    if domain in CLOSED:
+        pairs = load_file(source / "surface.safetensors")["surface.seam_pairs"]
+        found = list(covering(faces, image, pairs, domain))
+    else:
+        found = list(injective(faces, image, domain, _SINGLE))
     if certified:
         yield from (f"certified, but {complaint}" for complaint in found)
+        if domain in CLOSED:  # which have no coordinates in the file
+            return
         folded = _folded(faces, _coordinates(folder / f"{name}.obj"))
         if folded:
             yield f"certified, but {folded} triangles of {name}.obj are folded"

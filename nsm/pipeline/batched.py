@@ -27,7 +27,6 @@ from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.overfit import OverfitTask
 from nsm.pipeline.runner import built, finish, make_task
 from nsm.pipeline.sweep_jobs import ERROR_FILE, attempted, job_run, run_job
-from nsm.pipeline.task import Given
 from nsm.pipeline.training import Run, plain, trained
 from nsm.plugins import import_here
 from nsm.results.callbacks import Pictures
@@ -90,7 +89,6 @@ def member(run: Run, surface: Surface, console: Console) -> Member:
     """A member of a batch."""
     task = make_task(run.config, console)
     assert isinstance(task, OverfitTask)
-    task.choose_domain(Given(surface=surface))
     task.use(surface)
     return Member(run, task)
 

@@ -75,6 +75,7 @@ class CollectionMapTask(Task):
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
         """Take the surfaces, and the landmarks as vertices (L,) of their mesh files."""
+        self.choose_domain(Given(surfaces=phis))
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)

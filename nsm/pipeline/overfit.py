@@ -52,6 +52,7 @@ class OverfitTask(Task):
 
     def use(self, surface: Surface) -> None:
         """Take the prepared surface."""
+        self.choose_domain(Given(surface=surface))
         self.surface = surface
 
     def build(self) -> Any:

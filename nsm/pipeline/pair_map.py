@@ -88,6 +88,7 @@ class PairMapTask(Task):
 
     def use(self, phi: NeuralSurface, psi: NeuralSurface, ids: Sequence[np.ndarray]) -> None:
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
+        self.choose_domain(Given(source=phi, target=psi))
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:

@@ -47,6 +47,7 @@ class ParamTask(Task):
 
     def use(self, phi: NeuralSurface) -> None:
         """Take the neural surface."""
+        self.choose_domain(Given(phi=phi))
         self.phi, self.surface = phi, phi.surface
 
     def build(self) -> Any:
