@@ -16,7 +16,12 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.proposed_landmarks import AUTO, ProposedLandmarks, propose_landmarks
+from nsm.pipeline.proposed_landmarks import (
+    AUTO,
+    ProposedLandmarks,
+    asks_for_proposal,
+    propose_landmarks,
+)
 from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
     neural_surfaces,
@@ -77,9 +82,11 @@ class PairMapTask(Task):
         self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
         self.proposed = None
-        if isinstance(landmarks, str) and landmarks == AUTO:
-            self.proposed = propose_landmarks(shapes, **settings["proposal"], console=self.console)
-            landmarks = self.proposed.landmarks
+        if asks_for_proposal(landmarks, shapes, self.domain):
+            self.proposed = propose_landmarks(
+                shapes, **settings["proposal"], asked=landmarks == AUTO, console=self.console
+            )
+            landmarks = self.proposed.landmarks if self.proposed else None
         ids = landmark_vertices(landmarks, shapes, self.console)
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from nsm.correspondence import Proposal, proposed
+from nsm.domains import DOMAINS, Domain
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.resolve_inputs import Shape
@@ -57,15 +59,25 @@ class ProposedLandmarks:
         )
 
 
+def asks_for_proposal(landmarks: Any, shapes: Sequence[Shape], domain: Domain) -> bool:
+    """Whether landmarks are to be proposed: they are ``auto``, or none are given for closed meshes
+    of genus 0, on the orbifold."""
+    if isinstance(landmarks, str):
+        return landmarks == AUTO
+    meshes = all(isinstance(shape, Mesh) for shape in shapes)
+    return landmarks is None and meshes and domain == DOMAINS["orbifold"]
+
+
 def propose_landmarks(
-    shapes: Sequence[Shape], strict: bool, alternative: int, console: Console
-) -> ProposedLandmarks:
+    shapes: Sequence[Shape], strict: bool, alternative: int, asked: bool, console: Console
+) -> ProposedLandmarks | None:
     """Propose landmarks of two meshes, and say how sure they are.
 
     Args:
         shapes: source and target.
         strict: whether a proposal that is not sure is an error.
         alternative: which hypothesis is taken, 0 for the best.
+        asked: whether the user asked for it; else a mesh that has no tips gives None.
         console: where to say it.
 
     Raises:
@@ -83,7 +95,13 @@ def propose_landmarks(
             )
         meshes.append(clean(shape.vertices, shape.faces, shape.name))
     source, target = meshes
-    proposal = proposed((source.vertices, source.faces), (target.vertices, target.faces))
+    try:
+        proposal = proposed((source.vertices, source.faces), (target.vertices, target.faces))
+    except NsmError as error:
+        if asked or strict:
+            raise
+        console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
+        return None
     found = proposal.hypotheses
     if alternative >= len(found):
         raise NsmError(
