@@ -70,7 +70,9 @@ def prepare_jointly(
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
     enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
     apart = seam == "own" and domain.has_boundary
-    if _common_topology(meshes, cleaned) != (0, 0) or not enough or apart:
+    kinds = [topology.genus_and_boundary(c.faces) for c in cleaned]
+    common = check_common_topology([m.name for m in meshes], kinds)
+    if common != (0, 0) or not enough or apart:
         return [
             Surface.from_arrays(
                 m.vertices,
@@ -142,21 +144,22 @@ def _with_common_cones(
     ]
 
 
-def _common_topology(meshes: Sequence[Mesh], cleaned: Sequence[CleanMesh]) -> tuple[int, int]:
-    """Genus and number of boundary loops of all meshes.
+def check_common_topology(
+    names: Sequence[str], found: Sequence[tuple[int, int]]
+) -> tuple[int, int]:
+    """Genus and number of boundary loops of all surfaces.
 
     Raises:
         NsmError: ``wrong_topology``: they differ; a map would be torn.
     """
-    found = [topology.genus_and_boundary(c.faces) for c in cleaned]
-    for mesh, (genus, loops) in zip(meshes, found, strict=True):
+    for name, (genus, loops) in zip(names, found, strict=True):
         if (genus, loops) != found[0]:
             raise NsmError(
-                f"{mesh.name} has genus {genus} and {loops} boundary loops, {meshes[0].name} genus "
+                f"{name} has genus {genus} and {loops} boundary loops, {names[0]} genus "
                 f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes or "
                 "remove handles until they agree",
                 kind="wrong_topology",
-                key=mesh.name,
+                key=name,
             )
     return found[0]
 

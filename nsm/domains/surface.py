@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.base import Domain, Keys
 from nsm.domains.embedding import check_method
@@ -335,6 +337,15 @@ class Surface:
         """
         _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    @property
+    def topology(self) -> tuple[int, int]:
+        """Genus and number of boundary loops of the mesh before it was cut."""
+        n = len(self.vertices)
+        a, b = self.seam_pairs.T
+        joined = csr_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
+        first = connected_components(joined, directed=False)[1]
+        return topology.genus_and_boundary(first[self.faces])
 
     def at(self, uv: np.ndarray) -> np.ndarray:
         """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""

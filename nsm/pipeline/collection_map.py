@@ -17,7 +17,12 @@ from nsm.domains.orbifold.alignment import alignments_to_first
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
-from nsm.pipeline.resolve_inputs import landmark_vertices, neural_surfaces, read_shape
+from nsm.pipeline.resolve_inputs import (
+    landmark_vertices,
+    neural_surfaces,
+    read_shape,
+    refuse_other_topology,
+)
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
@@ -76,6 +81,7 @@ class CollectionMapTask(Task):
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
         """Take the surfaces, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(surfaces=phis))
+        refuse_other_topology(phis)
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)

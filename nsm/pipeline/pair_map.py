@@ -26,6 +26,7 @@ from nsm.pipeline.resolve_inputs import (
     landmark_vertices,
     neural_surfaces,
     read_shape,
+    refuse_other_topology,
     vertex_count,
 )
 from nsm.pipeline.task import Given, Task, frozen
@@ -96,6 +97,7 @@ class PairMapTask(Task):
     def use(self, phi: NeuralSurface, psi: NeuralSurface, ids: Sequence[np.ndarray]) -> None:
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(source=phi, target=psi))
+        refuse_other_topology([phi, psi])
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:

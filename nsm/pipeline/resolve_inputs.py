@@ -11,9 +11,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Domain, Surface, domain
-from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_jointly
+from nsm.domains.joint_preparation import (
+    Mesh,
+    check_common_topology,
+    matched_landmarks,
+    prepare_jointly,
+)
 from nsm.errors import NsmError
-from nsm.maps import ANALYTIC
+from nsm.maps import ANALYTIC, AnalyticSurface
 from nsm.pipeline.configured_surface import configured_repairs, report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
@@ -104,6 +109,18 @@ def _is_analytic(name: str, domain: Domain) -> bool:
         return False
     cut = domain.has_boundary and not lies_over(ANALYTIC[name], domain)
     return not (cut and name in catalogue_names())
+
+
+def refuse_other_topology(surfaces: Sequence[NeuralSurface]) -> None:
+    """Check ready surfaces of a map as :func:`nsm.domains.joint_preparation.prepare_jointly` checks
+    meshes; an analytic target is an exception: a closed surface may be torn open for it.
+
+    Raises:
+        NsmError: ``wrong_topology``: genus or number of boundary loops differ.
+    """
+    meshes = [phi.surface for phi in surfaces if not isinstance(phi.map, AnalyticSurface)]
+    if len(meshes) > 1:
+        check_common_topology([s.name for s in meshes], [s.topology for s in meshes])
 
 
 def vertex_count(shape: Shape) -> int:

@@ -229,3 +229,14 @@ def test_a_class_that_is_not_there_is_refused(shapes):
     with pytest.raises(NsmError) as error:
         nsm.map_pair(*files, [[v, v] for v in marks], overrides=overrides, progress=False)
     assert (error.value.kind, error.value.key) == ("out_of_range", "isotopy_class")
+
+
+def test_ready_surfaces_of_different_genus_are_refused(shapes):
+    """Both cut to a disc, where a map would be torn."""
+    ball, ring = (Surface.load(shapes[kind][0][0], cache=False) for kind in ("orbifold", "torus"))
+    assert (ball.topology, ring.topology) == ((0, 0), (1, 0))
+    overrides = ["experiment=quick", "trainer.max_steps=2", "artefacts=false"]
+    phis = [nsm.overfit(s, overrides=overrides, progress=False) for s in (ball, ring)]
+    with pytest.raises(NsmError) as error:
+        nsm.map_pair(*phis, progress=False)
+    assert error.value.kind == "wrong_topology"

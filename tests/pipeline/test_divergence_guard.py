@@ -14,14 +14,17 @@ from itertools import permutations
 
 import pytest
 import torch
+from domains.orbifold.shapes import torus
 from tiny import results
 
 import nsm
 from nsm.config import compose_config
-from nsm.domains import Disc
+from nsm.domains import Disc, Surface
 from nsm.errors import NsmError
+from nsm.maps import build_network
 from nsm.pipeline import Given, run_task
 from nsm.pipeline.folder_lock import folder_lock
+from nsm.results import NeuralSurface
 from nsm.results.analytic import analytic_surface
 from nsm.results.files import read_pair, write_pair
 from nsm.surfaces.shapes import ring_mesh
@@ -244,7 +247,11 @@ MAP_WORDS += ["artefacts=false", "map.width=8", "map.depth=1"]
 def mapped(task, folder, resuming=False):
     """What a map's training ends at: the weights, and where the vertices go."""
     phi, psi, _ = neural = tiny_surfaces()
-    config = compose_config([f"task={task}", *MAP_WORDS])
+    if task == "closed":
+        phi, psi = tiny_rings()
+        config = compose_config(["task=pair_map", *MAP_WORDS, "encoding.resolutions=[8]"])
+    else:
+        config = compose_config([f"task={task}", *MAP_WORDS])
     if task == "param":
         result = run_task(config, folder, Given(phi=phi), resuming=resuming)
         return {**result.map.state_dict(), "uv": torch.from_numpy(result.uv)}
@@ -263,6 +270,21 @@ def mapped(task, folder, resuming=False):
 @cache
 def tiny_surfaces():
     return results(rings=3).neural
+
+
+@cache
+def tiny_rings():
+    """Two closed surfaces of genus 1."""
+    points, faces = torus((12, 8))
+    rings = []
+    for height in (1.0, 1.3):
+        s = Surface.from_arrays(points * [1, 1, height], faces, name="ring", domain="torus")
+        encoding = {"_target_": "nsm.maps.SplineGrid", "resolutions": [16]}
+        phi = build_network(
+            map={"width": 4, "depth": 1}, encoding=s.domain.encoding(encoding, s.lattice)
+        )
+        rings.append(NeuralSurface(s, phi.eval().requires_grad_(False)))
+    return rings
 
 
 class Calls:
@@ -296,7 +318,7 @@ class Calls:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-@pytest.mark.parametrize("task", ["param", "pair_map", "collection_map"])
+@pytest.mark.parametrize("task", ["param", "pair_map", "closed", "collection_map"])
 def test_a_map_killed_at_random_moments_ends_at_the_same_result(tmp_path, task):
     """Whatever it was doing: training, saving, certifying, writing its results."""
     mapped(task, tmp_path / "first")  # what is imported late is imported now
