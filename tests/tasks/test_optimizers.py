@@ -48,11 +48,27 @@ def rates(settings, max_steps, steps):
 
 
 def test_sgdr_restarts_with_growing_periods():
-    lr = rates(schedule("SGDR", period=10, period_factor=2.0), 100, 40)
+    lr = rates(schedule("SGDR", period=10, period_factor=2.0), 70, 40)
     assert lr[0] == lr[10] == lr[30] == 1.0
     assert lr[5] == pytest.approx(0.5)
     assert lr[20] == pytest.approx(0.5)  # the middle of the second, longer period
     assert max(lr[1:10]) < 1.0
+
+
+@pytest.mark.parametrize("max_steps", [7, 10, 33, 100, 1000])
+@pytest.mark.parametrize("factor", [1.0, 1.5, 2.0])
+def test_the_last_wave_of_sgdr_ends_with_the_training(max_steps, factor):
+    settings = schedule("SGDR", period=10, period_factor=factor)
+    lr = rates(settings, max_steps, max_steps)
+    assert lr[-1] < 0.1
+    assert lr[-1] <= min(lr[-3:])
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    scheduler = build_scheduler(optimizer, settings, max_steps)
+    assert scheduler.wave_ends(max_steps)
+    falls = [k for k in range(1, max_steps) if lr[k] > lr[k - 1]]  # restarts
+    assert [k for k in range(max_steps) if scheduler.wave_ends(k)] == falls
+    # waves are stretched by less than the square root of the largest step between two totals
+    assert 10 / 3 < scheduler.first < 30 or max_steps < 10
 
 
 def test_cosine_falls_to_its_final_share():
