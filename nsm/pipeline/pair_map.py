@@ -249,7 +249,7 @@ class PairMapTask(Task):
                 export_surface(folder / f"{name}{ending}", *mesh)
         (folder / "morph").mkdir(exist_ok=True)
         for k in range(_MORPH_FRAMES):
-            frame = f.morph(k / (_MORPH_FRAMES - 1))
+            frame = f.source.in_original_units(f.morph(k / (_MORPH_FRAMES - 1)))
             export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)

@@ -105,6 +105,8 @@ def test_the_exports_are_closed_and_have_the_files_vertices_and_faces(made):
     for name in ("mapped.obj", "morph/00.obj", "morph/08.obj", "source_with_target_uv.obj"):
         mesh = trimesh.load(folder / name, process=False)
         assert mesh.is_watertight and (mesh.faces == given.faces).all(), name
+    first = trimesh.load(folder / "morph/00.obj", process=False)
+    np.testing.assert_allclose(first.vertices, given.vertices, atol=1e-6)
     assert np.load(folder / "mapped_vertices.npy").shape == given.vertices.shape
     mapped = trimesh.load(folder / "mapped.obj", process=False)
     np.testing.assert_allclose(mapped.vertices, np.load(folder / "mapped_vertices.npy"), rtol=1e-6)
