@@ -53,6 +53,21 @@ def compared(meshes: Path, pair: str, known: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
+def table(known: dict[str, Any]) -> str:
+    """The results as Markdown."""
+    head = ["pair", "way", "seconds", "median", "mean", "95th percentile"]
+    lines = [f"| {' | '.join([*head, 'landmarks, mean / largest'])} |", "|---" * 7 + "|"]
+    for pair, ways in known.items():
+        for way in WAYS:
+            of = ways[way]
+            energies = [f"{of[key]:.2f}" for key in FIGURES[:3]]
+            errors = (of[f"landmark_error_{key}_percent"] for key in ("mean", "max"))
+            row = [pair.replace("-", " → "), way, f"{of['seconds']:.1f}", *energies]
+            row.append(" / ".join(f"{error:.3f} %" for error in errors))
+            lines.append(f"| {' | '.join(row)} |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", type=Path, required=True)
@@ -64,6 +79,7 @@ def main() -> None:
         if not WAYS.keys() <= known.get(pair, {}).keys():
             known[pair] = compared(given.meshes, pair, known.get(pair, {}))
             RESULTS.write_text(json.dumps(known, indent=2) + "\n")
+    RESULTS.with_suffix(".md").write_text(table(known))
 
 
 if __name__ == "__main__":

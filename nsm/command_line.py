@@ -119,10 +119,12 @@ def _is_mesh(value: str) -> bool:
 
 def _readable_path(value: str) -> str:
     path = os.path.expanduser(value)
-    several = "," in path and not os.path.exists(path)  # values of a sweep
+    # values of a sweep
+    parts = path.split(",")
+    several = not os.path.exists(path) and all(Path(one).suffix for one in parts[:-1])
     if _PLAIN.fullmatch(path) or (not os.path.exists(path) and _readable(path)):
         return path
-    if several and not path.startswith(("[", "{", "'", '"')):
+    if len(parts) > 1 and several and not path.startswith(("[", "{", "'", '"')):
         return ",".join(_quoted(os.path.expanduser(one)) for one in path.split(","))
     return _quoted(path)
 

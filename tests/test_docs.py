@@ -26,7 +26,7 @@ OWN_TEST = "extending"
 PLAIN = [page for page in PAGES if page.stem != OWN_TEST]
 TASKS = ["task=overfit", "task=param", "task=pair_map", "task=collection_map"]
 ARGUMENTS = {"overrides", "folder", "candidate"}  # of functions, and of the benchmarks
-OTHER_COMMANDS = {"ssh", "tensorboard"}
+OTHER_COMMANDS = {".", "ssh", "tensorboard"}
 
 
 def by_name(page: Path) -> str:
@@ -152,7 +152,7 @@ def rows(text):
     ("page", "heading", "files"),
     [
         ("maps", "## Measurements", ["maps.md"]),
-        ("optimization", "## Error over time", ["overfit.md", "steps.md"]),
+        ("optimization", "## Error over time", ["overfit.md", "steps.md", "quasi_newton.md"]),
         ("activations", "| activation |", ["activation.md"]),
         ("robustness", "<!-- table -->", ["torture.md"]),
     ],

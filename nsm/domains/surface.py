@@ -103,6 +103,12 @@ class Surface:
         Raises:
             NsmError: no such file or name, or a mesh that cannot be prepared.
         """
+        if isinstance(path_or_name, Surface):
+            raise NsmError(
+                f"{path_or_name.name}: it is prepared already; give its mesh file or arrays",
+                kind="wrong_type",
+                key="path_or_name",
+            )
         mesh = given_mesh(path_or_name, "path_or_name")
         return cls.from_arrays(
             mesh.vertices,

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from nsm.config import compose_config
-from nsm.domains import Surface, domain
+from nsm.domains import Domain, Surface, domain
 from nsm.errors import NsmError
 from nsm.maps.networks import SKIPS
 from nsm.pipeline.batched import common_settings, member, overfit_ensemble
@@ -101,7 +101,7 @@ def cached_surfaces(
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
-    overfit = _overfit_config(config)
+    overfit = _overfit_config(config, surfaces[0].domain)
     settings = plain(overfit)
     if not _cacheable(settings):
         with temporary_folder() as folder:
@@ -156,8 +156,8 @@ def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Cons
             finish(one.task, one.run, module, trainer, started, index=index)
 
 
-def _overfit_config(config: DictConfig) -> DictConfig:
-    """The configuration with which the neural surfaces of a map are made."""
+def _overfit_config(config: DictConfig, on: Domain) -> DictConfig:
+    """The configuration with which the neural surfaces of a map are made, on a domain."""
     keys = ("accelerator", "devices", "threads", "precision", "progress")
     values = {key: config.trainer[key] for key in keys}
     overrides = [
@@ -169,7 +169,7 @@ def _overfit_config(config: DictConfig) -> DictConfig:
     ]
     overfit = compose_config([*overrides, *config.phi.overrides])
     with open_dict(overfit):
-        overfit.domain = config.domain
+        overfit.domain = on.config
     return overfit
 
 

@@ -61,6 +61,6 @@ def test_without_a_compiler_they_go_on(surface, monkeypatch, capsys):
 
     plain = nsm.overfit(surface, overrides=WORDS, progress=False)
     monkeypatch.setattr(torch, "compile", no_compiler)
-    phi = nsm.overfit(surface, overrides=[*WORDS, "trainer.compile=true"], progress=False)
+    phi = nsm.overfit(surface, overrides=[*WORDS, "trainer.compile=true"])
     assert torch.equal(weights(phi), weights(plain))
     assert "not compiled" in capsys.readouterr().out

@@ -53,13 +53,13 @@ def test_each_is_what_it_would_be_alone(surfaces, tmp_path, monkeypatch, words):
     alone, _ = made(surfaces, words, together=False)
     monkeypatch.setenv("NSM_CACHE", str(tmp_path / "together"))
     both, told = made(surfaces, words, together=True)
-    assert told.count("results in") == 2  # the third is the first
+    assert told.count(": neural surface in") == 2  # the third is the first
     uv = torch.as_tensor(surfaces[0].uv[:50], dtype=torch.float32)
     for a, b in zip(alone, both, strict=True):
         torch.testing.assert_close(a.map(uv), b.map(uv), rtol=1e-3, atol=1e-4)
         assert b.metrics["rms_percent"] == pytest.approx(a.metrics["rms_percent"], rel=0.01)
     again, told = made(surfaces, words, together=True)
-    assert "results in" not in told and told.count("from the cache") == 3
+    assert ": neural surface in" not in told and told.count("from the cache") == 3
     assert torch.equal(again[1].map(uv), both[1].map(uv))
     assert in_batches(tmp_path / "together") == [2, 2]
 
