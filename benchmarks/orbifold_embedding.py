@@ -1,12 +1,10 @@
-"""Closed shapes laid out on the flat orbifold: time, distortion, flips, and splines fitted to them.
+"""Closed shapes laid out on the flat orbifold: time, distortion and flips.
 
-    python benchmarks/orbifold_embedding.py [../shared/meshes] [--only NAME ...] [--cells 128]
+    python benchmarks/orbifold_embedding.py [../shared/meshes] [--only NAME ...]
 
 Seconds are of the processor, on one thread: choosing four cones among the surface's extremities,
 and the embedding from the raw mesh. Distortion is symmetric Dirichlet (ε = 0.01) of the map from
 the mesh to the domain's plane, both of the same area: median and 95th percentile over triangles.
-RMS, in percent of the diagonal, is that of the even periodic spline of about cells² coefficients
-that is nearest to the mesh.
 """
 
 from __future__ import annotations
@@ -22,13 +20,12 @@ import numpy as np
 
 from nsm.domains.orbifold.cones import choose_cones
 from nsm.domains.orbifold.embedding import embed_orbifold
-from nsm.domains.orbifold.fitting import fitted_spline, resolution_for, rms_error
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.loading import EXTENSIONS, load_mesh
 
-_HEADER = ("mesh", "vertices", "cones s", "embed s", "median", "95 %", "flips", "aspect", "RMS %")
-_ROW = "{:<18}{:>10}{:>9}{:>9}{:>9}{:>9}{:>7}{:>8}{:>8}"
+_HEADER = ("mesh", "vertices", "cones s", "embed s", "median", "95 %", "flips", "aspect")
+_ROW = "{:<18}{:>10}{:>9}{:>9}{:>9}{:>9}{:>7}{:>8}"
 
 
 def closed_sphere(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -48,7 +45,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", default="../shared/meshes", type=Path)
     parser.add_argument("--only", nargs="*", help="names of meshes")
-    parser.add_argument("--cells", type=int, default=128, help="of the spline, along a side")
     options = parser.parse_args()
     print(_ROW.format(*_HEADER))
     medians, tails = [], []
@@ -72,8 +68,6 @@ def main() -> None:
         medians.append(median)
         tails.append(tail)
         lengths = np.linalg.norm(embedding.lattice, axis=0)
-        size = resolution_for(embedding.lattice, options.cells**2)
-        rms = rms_error(fitted_spline(embedding, vertices, size), embedding, vertices)
         print(
             _ROW.format(
                 path.stem,
@@ -84,7 +78,6 @@ def main() -> None:
                 f"{tail:.1f}",
                 int(embedding.certificate().flipped.sum()),
                 f"{lengths.max() / lengths.min():.2f}",
-                f"{rms:.3f}",
             ),
             flush=True,
         )

@@ -10,8 +10,7 @@ from domains.orbifold.shapes import limbs, torus
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.cover import lifted_near, located, triangles_over_domain
 from nsm.domains.orbifold.embedding import Embedding, embed_orbifold, embed_torus, twisted
-from nsm.domains.orbifold.maps import PeriodicSplineGrid
-from nsm.maps import EquivariantMap, LatticeAligned, TorusMap
+from nsm.maps import EquivariantMap, LatticeAligned, SplineField, TorusMap
 
 
 @pytest.fixture(scope="module", params=["orbifold", "torus"])
@@ -94,7 +93,9 @@ def _twisted(displacement: torch.nn.Module) -> LatticeAligned:
 
 def test_small_equivariant_maps_are_certified(embedding: Embedding) -> None:
     torch.manual_seed(0)
-    displacement = PeriodicSplineGrid([4], 2, scale=0.02).double()
+    displacement = SplineField(2, 4, periodic=True).double()
+    for parameter in displacement.parameters():
+        torch.nn.init.normal_(parameter, std=0.02)
     if embedding.cones is not None:
         maps: list[tuple[torch.nn.Module, np.ndarray | None]] = [
             (EquivariantMap.around(displacement), None)
