@@ -85,6 +85,7 @@ def test_functions_of_the_domain(array):
 @given(ANY_ARRAY | rows_of(3))
 def test_functions_of_space(array):
     check_points(PAIR, array, 3, (3,))
+    check_points(PAIR.inverse, array, 3, (3,))
     check_points(PAIR.aligned, array, 3, (3,))
     check_points(NEURAL[0].in_original_units, array, 3, (3,))
 
@@ -206,6 +207,15 @@ def test_transfer(values, back):
         assert values.min() - room <= carried.min() <= carried.max() <= values.max() + room
     if values.dtype.kind in "ib":
         assert set(np.unique(carried)) <= set(np.unique(values)) and carried.dtype == values.dtype
+
+
+@examples(20)
+@given(arrays.arrays(np.float64, (VERTICES, 2), elements=st.floats(-1e6, 1e6)))
+def test_the_matrix_transfers(values):
+    matrix = PAIR.matrix()
+    np.testing.assert_allclose(matrix @ values, PAIR.transfer(values), atol=1e-6)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0)
+    assert matrix.min() >= -1e-12
 
 
 @examples(30)
@@ -670,6 +680,8 @@ PROPERTIES: dict[str, list[Callable]] = {
     "SurfaceMap.bake": [test_what_is_baked],
     "SurfaceMap.places": [test_places_are_those_of_points],
     "SurfaceMap.transfer": [test_transfer],
+    "SurfaceMap.matrix": [test_the_matrix_transfers],
+    "SurfaceMap.inverse": [test_functions_of_space],
     "SurfaceMap.morph": [test_morph],
     "SurfaceMap.aligned": [test_functions_of_space],
     "SurfaceMap.repaired": [test_repaired_maps_are_certified],

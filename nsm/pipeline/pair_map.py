@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from rich.text import Text
+from scipy.sparse import save_npz
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
@@ -247,6 +248,7 @@ class PairMapTask(Task):
         for name, mesh in meshes.items():
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
+        save_npz(folder / "source_to_target.npz", f.matrix())
         (folder / "morph").mkdir(exist_ok=True)
         for k in range(_MORPH_FRAMES):
             frame = f.source.in_original_units(f.morph(k / (_MORPH_FRAMES - 1)))

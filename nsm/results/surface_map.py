@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from torch import nn
 
 from nsm.domains import Surface
@@ -71,6 +72,22 @@ class SurfaceMap:
             normalised = (points - s.center) * s.scale
         image = locate(normalised, s.vertices, s.faces).take(self.image_uv, s.faces)
         return self.target.in_original_units(t.at(image))
+
+    def inverse(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) anywhere on the target to those (N, 3) of the source that f sends there.
+
+        Points off the target start from the nearest point on it.
+
+        Raises:
+            NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
+        """
+        s, t = self.source.surface, self.target.surface
+        points = as_points(points, 3, "points on the target")
+        with np.errstate(over="ignore"):  # of points far away
+            normalised = (points - t.center) * t.scale
+        uv = locate(normalised, t.vertices, t.faces).take(t.uv, t.faces)
+        preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
+        return self.source.in_original_units(s.at(preimage))
 
     def planar(self, uv: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the source's domain to those of the target's, (N, 2).
@@ -223,6 +240,21 @@ class SurfaceMap:
         start, end = (read_file_mesh(one) for one in ends)
         return painted(self, start, paint, end, back=back, size=size)
 
+    def matrix(self) -> csr_matrix:
+        """The matrix (W, V) that :meth:`transfer` applies to values at the source's vertices.
+
+        Rows belong to vertices of the target's mesh file, columns to those of the source's. Rows
+        have a sum of one and no negative entries.
+        """
+        s, t = self.source.surface, self.target.surface
+        ids = np.arange(len(t.vertices))
+        columns = s.faces[self._back.face]
+        blend = csr_matrix(
+            (self._back.weights.ravel(), (np.repeat(ids, 3), columns.ravel())),
+            shape=(len(ids), len(s.vertices)),
+        )
+        return csr_matrix(blend[by_file_vertex(t, ids)] @ cut_mesh_matrix(s))
+
     def morph(self, t: float) -> np.ndarray:
         """Vertices (V, 3) on straight lines from the source (t = 0) to the target (t = 1).
 
@@ -325,3 +357,18 @@ def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
         around = around[surface.source_vertex[around] >= 0]
         result[vertex] = result[around[0]] if whole else result[around].mean(axis=0)
     return result
+
+
+def cut_mesh_matrix(surface: Surface) -> csr_matrix:
+    """What :func:`on_cut_mesh` does to numbers, as a matrix (V, W)."""
+    known = np.flatnonzero(surface.source_vertex >= 0)
+    rows, columns, weights = [known], [surface.source_vertex[known]], [np.ones(len(known))]
+    for vertex in np.flatnonzero(surface.source_vertex < 0).tolist():
+        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
+        around = around[surface.source_vertex[around] >= 0]
+        rows.append(np.full(len(around), vertex))
+        columns.append(surface.source_vertex[around])
+        weights.append(np.full(len(around), 1 / len(around)))
+    entries = (np.concatenate(rows), np.concatenate(columns))
+    shape = (len(surface.vertices), len(surface.cut_vertex))
+    return csr_matrix((np.concatenate(weights), entries), shape=shape)

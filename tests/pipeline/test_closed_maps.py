@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from domains.orbifold.shapes import limbs, torus
+from scipy.sparse import load_npz
 
 import nsm
 from nsm.domains import Surface
@@ -129,6 +130,19 @@ def test_signals_go_over_and_back(made):
     back = f.transfer(f.transfer(source.vertices[:, 0]), back=True)
     assert np.abs(back - source.vertices[:, 0]).mean() < 0.05 * np.ptp(source.vertices[:, 0])
     assert f.transfer(np.ones(len(source.vertices))) == pytest.approx(1.0)
+
+
+def test_points_and_values_go_back(made):
+    folder, f, files, _ = made
+    source = trimesh.load(files[0], process=False)
+    points = source.triangles_center
+    diagonal = np.linalg.norm(np.ptp(source.vertices, axis=0))
+    off = np.linalg.norm(f.inverse(f(points)) - points, axis=1)
+    assert np.median(off) < 1e-3 * diagonal and off.max() < 0.05 * diagonal
+    values = source.vertices[:, 1]
+    np.testing.assert_allclose(f.matrix() @ values, f.transfer(values), atol=1e-9)
+    stored = load_npz(folder / "source_to_target.npz")
+    np.testing.assert_allclose(stored @ values, f.transfer(values), atol=1e-9)
 
 
 def test_a_stored_map_is_the_same(made):
