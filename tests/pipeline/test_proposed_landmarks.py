@@ -8,10 +8,11 @@ import trimesh
 from rich.console import Console
 
 from nsm.correspondence import Hypothesis, Proposal
+from nsm.domains import DOMAINS
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline import proposed_landmarks
-from nsm.pipeline.proposed_landmarks import propose_landmarks
+from nsm.pipeline.proposed_landmarks import asks_for_proposal, propose_landmarks
 from nsm.surfaces.landmark_files import read_pairs
 from nsm.surfaces.shapes import sphere
 
@@ -37,7 +38,8 @@ def answers(monkeypatch, margin, score=2.0):
 def proposed_with(margin, monkeypatch, strict=False, alternative=0, score=2.0):
     answers(monkeypatch, margin, score)
     console = Console(record=True, width=300)
-    return propose_landmarks(meshes(), strict, alternative, console), console.export_text()
+    found = propose_landmarks(meshes(), strict, alternative, True, console)
+    return found, console.export_text()
 
 
 def test_a_sure_proposal_is_taken_in_the_numbers_of_the_files(monkeypatch, tmp_path):
@@ -71,8 +73,34 @@ def test_the_second_best_is_one_flag_away(monkeypatch):
 
 def test_only_meshes_are_proposed_for():
     with pytest.raises(NsmError) as refused:
-        propose_landmarks([meshes()[0], SimpleNamespace()], False, 0, Console(quiet=True))
+        propose_landmarks([meshes()[0], SimpleNamespace()], False, 0, True, Console(quiet=True))
     assert (refused.value.kind, refused.value.key) == ("wrong_type", "landmarks")
+
+
+def test_closed_meshes_without_landmarks_have_some_proposed():
+    orbifold, disc = DOMAINS["orbifold"], DOMAINS["disc"]
+    assert asks_for_proposal(None, meshes(), orbifold)
+    assert asks_for_proposal("auto", meshes(), disc)
+    for landmarks, shapes, domain in (
+        (None, meshes(), disc),
+        ([], meshes(), orbifold),
+        ("pairs.json", meshes(), orbifold),
+        (None, [meshes()[0], SimpleNamespace()], orbifold),
+    ):
+        assert not asks_for_proposal(landmarks, shapes, domain)
+
+
+def test_shapes_without_a_proposal_are_mapped_without_landmarks_unless_asked(monkeypatch):
+    def nothing(*_):
+        raise NsmError("no tips", kind="no_proposal", key="landmarks")
+
+    monkeypatch.setattr(proposed_landmarks, "proposed", nothing)
+    console = Console(record=True, width=300)
+    assert propose_landmarks(meshes(), False, 0, False, console) is None
+    assert "no tips" in console.export_text()
+    for strict, asked in ((True, False), (False, True)):
+        with pytest.raises(NsmError):
+            propose_landmarks(meshes(), strict, 0, asked, Console(quiet=True))
 
 
 def test_the_command_trains_with_them_and_leaves_the_file(here, tmp_path, monkeypatch):
