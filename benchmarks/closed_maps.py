@@ -16,7 +16,6 @@ import itertools
 import json
 import platform
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import mean
@@ -25,11 +24,11 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from maps import ANIMALS, table, timed
 
 import nsm
 
 RESULTS = Path(__file__).parent / "results" / "closed_maps"
-ANIMALS = ("shrec07-381", "shrec07-384", "shrec07-388", "shrec07-393")
 FURTHER = (("385", "391"), ("392", "383"), ("395", "397"), ("398", "400"))
 KEPT = (
     "symmetric_dirichlet_median",
@@ -43,12 +42,6 @@ KEPT = (
     "certified",
 )
 START = ["trainer.max_steps=1", "artefacts=false", "certification.repair=false"]  # fills the cache
-
-
-def timed(make: Callable[[], Any]) -> tuple[Any, float]:
-    start = time.process_time()
-    result = make()
-    return result, round(time.process_time() - start, 1)
 
 
 def figures(f: Any, seconds: float) -> dict[str, Any]:
@@ -170,8 +163,7 @@ def tables() -> str:
     """All results as Markdown; the distortion is symmetric Dirichlet."""
     files = sorted(RESULTS.glob("*.json"))
     results = [json.loads(f.read_text()) for f in files]
-    head = ["map", "domain", *COLUMNS.values(), "certified"]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    rows = []
     ratios: dict[str, list[float]] = {key: [] for key in COLUMNS}
     for found in results:
         closed = found["closed_domain"]
@@ -179,8 +171,7 @@ def tables() -> str:
             of = found[domain]
             row = [f"{of[key]:.2f}" if key in of else "–" for key in COLUMNS]
             name = found["case"] if domain == "disc" else ""
-            certified = "yes" if of["certified"] else "no"
-            lines.append("| " + " | ".join([name, domain, *row, certified]) + " |")
+            rows.append([name, domain, *row, "yes" if of["certified"] else "no"])
         for key, values in ratios.items():
             if key in found["disc"] and key in found[closed]:
                 values.append(found[closed][key] / found["disc"][key])
@@ -189,9 +180,8 @@ def tables() -> str:
         for (key, label), values in zip(COLUMNS.items(), ratios.values(), strict=True)
         if values and "landmark" not in key
     ]
-    return (
-        "\n".join(lines) + f"\n\nClosed domain over disc, mean of the ratios: {', '.join(means)}.\n"
-    )
+    shown = table(["map", "domain", *COLUMNS.values(), "certified"], rows)
+    return f"{shown}\n\nClosed domain over disc, mean of the ratios: {', '.join(means)}.\n"
 
 
 def main() -> None:

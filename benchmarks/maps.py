@@ -167,7 +167,7 @@ def tables() -> str:
             changes.append([name, *_values(found["metrics"], COLUMNS), *row])
         elif "pairs" not in found["metrics"]:
             maps.append([name.replace("-", " → "), *_values(found["metrics"], COLUMNS), *row])
-    parts = [_table(["map", *COLUMNS.values(), "seconds"], maps)]
+    parts = [table(["map", *COLUMNS.values(), "seconds"], maps)]
     if "collection" in results:
         found = results["collection"]
         rows = [
@@ -180,11 +180,11 @@ def tables() -> str:
             f"{found['map_seconds']:.0f} s; cycle error\n{mean:.3f} % of the diagonal in the mean, "
             f"{most:.2f} % at most:"
         )
-        parts.append(_table(["pair", *COLUMNS.values()], rows))
+        parts.append(table(["pair", *COLUMNS.values()], rows))
     parts.append("One setting changed at a time, on 384 → 388 (cut as a pair):")
-    parts.append(_table(["change", *COLUMNS.values(), "seconds"], changes))
+    parts.append(table(["change", *COLUMNS.values(), "seconds"], changes))
     parts.append("Flattening, beside libigl's methods on the same cut mesh:")
-    parts.append(_table(["surface", "method", *FLAT.values()], flat))
+    parts.append(table(["surface", "method", *FLAT.values()], flat))
     return "\n\n".join(parts) + "\n"
 
 
@@ -200,7 +200,7 @@ def _values(metrics: dict[str, float], columns: dict[str, str]) -> list[str]:
     return [f"{metrics[key]:.{2 if key == 'covered_percent' else 3}f}" for key in columns]
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
+def table(head: list[str], rows: list[list[str]]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from nsm.domains.orbifold.cones import decimated, extremities
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.geometry import edge_graph
 
 _FACES = 1000
 _TIPS = 8
@@ -98,11 +98,7 @@ def edge_distances(
     vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray | None = None
 ) -> np.ndarray:
     """Lengths (S, V) of shortest paths along edges, from sources (S,) or from all vertices."""
-    pairs = topology.edges_of(faces).pairs
-    length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1).clip(1e-300)
-    n = len(vertices)
-    graph = csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(dijkstra(graph, directed=False, indices=sources))
+    return np.asarray(dijkstra(edge_graph(vertices, faces), directed=False, indices=sources))
 
 
 def _spread(distance: np.ndarray, chosen: list[int], count: int) -> np.ndarray:

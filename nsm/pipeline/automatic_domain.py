@@ -14,6 +14,7 @@ from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, build_analytic
 from nsm.results import NeuralSurface, load_surface
+from nsm.results.artifact import is_stored_surface
 from nsm.surfaces.given import given_mesh
 from nsm.surfaces.topology import genus_and_boundary
 from nsm.surfaces.validation import clean
@@ -68,7 +69,7 @@ def _told_by(given: Any, config: DictConfig) -> tuple[Domain | None, tuple[int, 
     if given is None:
         return None, None  # refused where it is read
     name = str(given) if isinstance(given, (str, Path)) else ""
-    if name and ((Path(name) / "surface.json").exists() or name.endswith("surface.safetensors")):
+    if name and is_stored_surface(name):
         return load_surface(name, trust=config.trust).surface.domain, None
     if name in ANALYTIC and name == str(config.get("target")):
         return _analytic({"name": name}), None

@@ -22,7 +22,12 @@ from nsm.errors import NsmError
 from nsm.instantiation import made, target_of
 from nsm.maps.networks import SKIPS
 from nsm.pipeline.automatic_domain import choose_domain, is_automatic
-from nsm.pipeline.configured_surface import configured_surface, keep_absolute, report_surface
+from nsm.pipeline.configured_surface import (
+    configured_surface,
+    keep_absolute,
+    named_mesh,
+    report_surface,
+)
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.overfit import OverfitTask
 from nsm.pipeline.runner import built, finish, make_task
@@ -230,9 +235,7 @@ def _ready(
     run = job_run(settings, place)
     keep_absolute(run.config)
     if is_automatic(run.config.domain):
-        given = run.config.surface
-        named = given.name if given.path is None else given.path
-        choose_domain(run.config, [named], console, closed=True)
+        choose_domain(run.config, [named_mesh(run.config)], console, closed=True)
     key = f"{run.config.surface} {run.config.domain}"
     if key not in surfaces:
         surfaces[key] = configured_surface(run.config, console)

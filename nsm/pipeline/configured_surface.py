@@ -20,6 +20,12 @@ def keep_absolute(config: DictConfig) -> None:
         config.surface.path = os.path.abspath(config.surface.path)
 
 
+def named_mesh(config: DictConfig) -> str:
+    """The mesh file, or the name of the catalogue, of the group ``surface``."""
+    settings = config.surface
+    return str(settings.name if settings.path is None else settings.path)
+
+
 def configured_repairs(config: DictConfig) -> Repairs:
     """The decisions of the group ``surface`` on meshes; older run folders have none."""
     return Repairs(config.surface.get("parts"), config.surface.get("repair"))
@@ -39,7 +45,7 @@ def configured_surface(config: DictConfig, console: Console, given: Any = None) 
     keep_absolute(config)
     settings = config.surface
     if given is None:
-        given = settings.path if settings.path is not None else settings.name
+        given = named_mesh(config)
     name = Path(given).stem if isinstance(given, (str, Path)) else "mesh"
     with stage(console, f"preparing {name}"):
         return Surface.load(

@@ -9,7 +9,12 @@ import numpy as np
 
 from nsm.data import SurfaceData
 from nsm.domains import Surface
-from nsm.pipeline.configured_surface import configured_surface, keep_absolute, report_surface
+from nsm.pipeline.configured_surface import (
+    configured_surface,
+    keep_absolute,
+    named_mesh,
+    report_surface,
+)
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
@@ -43,8 +48,7 @@ class OverfitTask(Task):
         if given.surface is not None:
             return [given.surface]
         keep_absolute(self.config)
-        settings = self.config.surface
-        return [settings.name if settings.path is None else settings.path]
+        return [named_mesh(self.config)]
 
     def prepare(self, given: Given) -> None:
         self.use(configured_surface(self.config, self.console, given.surface))

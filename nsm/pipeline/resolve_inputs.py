@@ -23,6 +23,7 @@ from nsm.pipeline.configured_surface import configured_repairs, report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
 from nsm.results import NeuralSurface, analytic_surface, load_surface
 from nsm.results.analytic import lies_over
+from nsm.results.artifact import is_stored_surface
 from nsm.stages import stage
 from nsm.surfaces.catalogue import (
     catalogue_landmarks,
@@ -83,7 +84,7 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
         return Mesh(mesh.name, mesh.vertices, mesh.faces, mesh.log)
     else:
         name = str(given)
-        if (Path(name) / "surface.json").exists() or name.endswith("surface.safetensors"):
+        if is_stored_surface(name):
             ready = load_surface(name, trust=trust)
         elif key == "target" and _is_analytic(name, domain):
             return analytic_surface({"name": name}, domain)

@@ -123,6 +123,12 @@ def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
     write_pair(Path(folder) / STEM, FORMAT, tensors, metadata)
 
 
+def is_stored_surface(name: str) -> bool:
+    """Whether a path is that of what :func:`save_surface` wrote: the folder or the weights."""
+    file = f"{STEM}.safetensors"
+    return (Path(name) / f"{STEM}.json").exists() or name.endswith(file)
+
+
 def load_surface(folder: str | Path, trust: Iterable[str] = ()) -> NeuralSurface:
     """Read what :func:`save_surface` wrote.
 

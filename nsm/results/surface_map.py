@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
@@ -67,10 +67,7 @@ class SurfaceMap:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         s, t = self.source.surface, self.target.surface
-        points = as_points(points, 3, "points on the source")
-        with np.errstate(over="ignore"):  # of points far away
-            normalised = (points - s.center) * s.scale
-        image = locate(normalised, s.vertices, s.faces).take(self.image_uv, s.faces)
+        image = _located(s, points, "points on the source").take(self.image_uv, s.faces)
         return self.target.in_original_units(t.at(image))
 
     def inverse(self, points: np.ndarray) -> np.ndarray:
@@ -82,10 +79,7 @@ class SurfaceMap:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         s, t = self.source.surface, self.target.surface
-        points = as_points(points, 3, "points on the target")
-        with np.errstate(over="ignore"):  # of points far away
-            normalised = (points - t.center) * t.scale
-        uv = locate(normalised, t.vertices, t.faces).take(t.uv, t.faces)
+        uv = _located(t, points, "points on the target").take(t.uv, t.faces)
         preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
         return self.source.in_original_units(s.at(preimage))
 
@@ -350,11 +344,8 @@ def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
         message = f"{surface.name} has {needed} vertices, but {rows} rows were given"
         raise NsmError(message, kind="wrong_shape", key=surface.name)
     result = values[np.maximum(surface.source_vertex, 0)]
-    inserted = np.flatnonzero(surface.source_vertex < 0)
     whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool
-    for vertex in inserted.tolist():
-        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
-        around = around[surface.source_vertex[around] >= 0]
+    for vertex, around in _inserted(surface):
         result[vertex] = result[around[0]] if whole else result[around].mean(axis=0)
     return result
 
@@ -363,12 +354,25 @@ def cut_mesh_matrix(surface: Surface) -> csr_matrix:
     """What :func:`on_cut_mesh` does to numbers, as a matrix (V, W)."""
     known = np.flatnonzero(surface.source_vertex >= 0)
     rows, columns, weights = [known], [surface.source_vertex[known]], [np.ones(len(known))]
-    for vertex in np.flatnonzero(surface.source_vertex < 0).tolist():
-        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
-        around = around[surface.source_vertex[around] >= 0]
+    for vertex, around in _inserted(surface):
         rows.append(np.full(len(around), vertex))
         columns.append(surface.source_vertex[around])
         weights.append(np.full(len(around), 1 / len(around)))
     entries = (np.concatenate(rows), np.concatenate(columns))
     shape = (len(surface.vertices), len(surface.cut_vertex))
     return csr_matrix((np.concatenate(weights), entries), shape=shape)
+
+
+def _inserted(surface: Surface) -> Iterator[tuple[int, np.ndarray]]:
+    """Each vertex that was inserted between others, and its neighbours (N,) of the mesh file."""
+    for vertex in np.flatnonzero(surface.source_vertex < 0).tolist():
+        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
+        yield vertex, around[surface.source_vertex[around] >= 0]
+
+
+def _located(surface: Surface, points: np.ndarray, what: str) -> Places:
+    """The places on a surface's mesh nearest to points (N, 3) in the units of its file."""
+    points = as_points(points, 3, what)
+    with np.errstate(over="ignore"):  # of points far away
+        normalised = (points - surface.center) * surface.scale
+    return locate(normalised, surface.vertices, surface.faces)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_matrix
+
+from nsm.surfaces.topology import edges_of
 
 _DIRECTIONS = 200  # of rays for ambient occlusion
 
@@ -13,6 +16,15 @@ def subdivide(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
     fine, fine_faces = igl.upsample(np.ascontiguousarray(points), faces, 1)
     return fine, np.asarray(fine_faces, dtype=np.int64)
+
+
+def edge_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """The edges of a mesh with their lengths, each once, for shortest paths: (V, V)."""
+    pairs = edges_of(faces).pairs
+    length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    n = len(vertices)
+    # no length is zero, which a sparse matrix would leave out
+    return csr_matrix((length.clip(1e-300), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
 
 
 def decimate(

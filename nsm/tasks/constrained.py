@@ -21,13 +21,13 @@ class ConstrainedMap(Training):
     """Base of the tasks that map surfaces to surfaces.
 
     With ``constraints.boundary=exact``, or on a closed domain, h maps Ω to itself by construction;
-    with ``penalty``,
-    λ_B times the mean squared distance of h(∂Ω) to ∂Ω is added, and samples that h maps out of Ω
-    leave the distortion and are pulled back. With ``constraints.landmarks=augmented``, multipliers
-    are updated every ``multiplier_every`` steps once the ramp is over (augmented Lagrangian), so
-    that landmarks are met whatever λ_C is; with ``fixed``, λ_C acts alone. During the ramp, a share
-    of the steps, the landmarks' targets move from where h has them at its start to their places,
-    and the seam's weight grows from zero: with the full terms at once, h would fold.
+    with ``penalty``, λ_B times the mean squared distance of h(∂Ω) to ∂Ω is added, and samples that
+    h maps out of Ω leave the distortion and are pulled back. With
+    ``constraints.landmarks=augmented``, multipliers are updated every ``multiplier_every`` steps
+    once the ramp is over (augmented Lagrangian), so that landmarks are met whatever λ_C is; with
+    ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the landmarks' targets move
+    from where h has them at its start to their places, and the seam's weight grows from zero: with
+    the full terms at once, h would fold.
 
     Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
     ``landmark_error``.

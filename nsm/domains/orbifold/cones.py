@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from nsm.domains.decimation import coarsen, present_faces
@@ -15,6 +14,7 @@ from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, l
 from nsm.domains.orbifold.newton import distortions
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.geometry import edge_graph
 
 _FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
 LARGE = 40_000
@@ -46,10 +46,7 @@ def extremities(vertices: np.ndarray, faces: np.ndarray, count: int = _EXTREMITI
     """
     coarse, ids = decimated(vertices, faces, _FACES)
     points = vertices[ids]
-    pairs = topology.edges_of(coarse).pairs
-    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).clip(1e-300)
-    n = len(ids)
-    graph = csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    n, graph = len(ids), edge_graph(points, coarse)
 
     def distance(v: int) -> np.ndarray:
         return np.asarray(dijkstra(graph, directed=False, indices=v))
