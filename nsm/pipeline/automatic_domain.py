@@ -13,6 +13,7 @@ from nsm.domains import Automatic, Domain, Surface, domain
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, build_analytic
+from nsm.pipeline.configured_surface import configured_repairs
 from nsm.results import NeuralSurface, load_surface
 from nsm.results.artifact import is_stored_surface
 from nsm.surfaces.given import given_mesh
@@ -74,7 +75,8 @@ def _told_by(given: Any, config: DictConfig) -> tuple[Domain | None, tuple[int, 
     if name in ANALYTIC and name == str(config.get("target")):
         return _analytic({"name": name}), None
     mesh = given_mesh(given)
-    return None, genus_and_boundary(clean(mesh.vertices, mesh.faces, mesh.name).faces)
+    repairs = configured_repairs(config)
+    return None, genus_and_boundary(clean(mesh.vertices, mesh.faces, mesh.name, repairs).faces)
 
 
 def _analytic(given: dict[str, Any]) -> Domain | None:

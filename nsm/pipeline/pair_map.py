@@ -17,6 +17,7 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.configured_surface import configured_repairs
 from nsm.pipeline.proposed_landmarks import (
     AUTO,
     ProposedLandmarks,
@@ -86,7 +87,11 @@ class PairMapTask(Task):
         self.proposed = None
         if asks_for_proposal(landmarks, shapes, self.domain):
             self.proposed = propose_landmarks(
-                shapes, **settings["proposal"], asked=landmarks == AUTO, console=self.console
+                shapes,
+                **settings["proposal"],
+                asked=landmarks == AUTO,
+                console=self.console,
+                repairs=configured_repairs(self.config),
             )
             landmarks = self.proposed.landmarks if self.proposed else None
         ids = landmark_vertices(landmarks, shapes, self.console)

@@ -16,7 +16,7 @@ from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.landmark_files import to_json
-from nsm.surfaces.validation import clean
+from nsm.surfaces.validation import NO_DECISION, Repairs, clean
 
 AUTO = "auto"
 
@@ -69,7 +69,12 @@ def asks_for_proposal(landmarks: Any, shapes: Sequence[Shape], domain: Domain) -
 
 
 def propose_landmarks(
-    shapes: Sequence[Shape], strict: bool, alternative: int, asked: bool, console: Console
+    shapes: Sequence[Shape],
+    strict: bool,
+    alternative: int,
+    asked: bool,
+    console: Console,
+    repairs: Repairs = NO_DECISION,
 ) -> ProposedLandmarks | None:
     """Propose landmarks of two meshes, and say how sure they are.
 
@@ -79,6 +84,7 @@ def propose_landmarks(
         alternative: which hypothesis is taken, 0 for the best.
         asked: whether the user asked for it; else a mesh that has no tips gives None.
         console: where to say it.
+        repairs: the user's decisions on the meshes.
 
     Raises:
         NsmError: ``wrong_type``: a shape that is no mesh; ``unsure_landmarks``; ``out_of_range``:
@@ -93,7 +99,7 @@ def propose_landmarks(
                 kind="wrong_type",
                 key="landmarks",
             )
-        meshes.append(clean(shape.vertices, shape.faces, shape.name))
+        meshes.append(clean(shape.vertices, shape.faces, shape.name, repairs))
     source, target = meshes
     try:
         proposal = proposed((source.vertices, source.faces), (target.vertices, target.faces))

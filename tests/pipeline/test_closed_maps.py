@@ -10,12 +10,15 @@ import pytest
 import torch
 import trimesh
 from domains.orbifold.shapes import limbs, torus
+from rich.console import Console
 from scipy.sparse import load_npz
 
 import nsm
+from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.domains.orbifold.alignment import alignments
 from nsm.errors import NsmError
+from nsm.pipeline.automatic_domain import choose_domain
 from nsm.results.metrics import evaluate
 
 QUICK = [
@@ -256,3 +259,20 @@ def test_ready_surfaces_of_different_genus_are_refused(shapes):
     with pytest.raises(NsmError) as error:
         nsm.map_pair(*phis, progress=False)
     assert error.value.kind == "wrong_topology"
+
+
+def test_the_domain_is_that_of_the_part_that_is_kept(tmp_path):
+    """domain=auto looks at the mesh as the user's decisions leave it."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    small = ball.copy().apply_scale(0.3).apply_translation([3, 0, 0])
+    both = trimesh.util.concatenate([ball, small])
+    file = _exported(tmp_path, "both", both.vertices, both.faces)
+
+    def chosen(*words):
+        config = compose_config([f"surface.path={file}", *words])
+        return str(choose_domain(config, [file], Console(quiet=True), closed=True))
+
+    assert chosen("surface.parts=largest") == "orbifold"
+    with pytest.raises(NsmError) as error:
+        chosen()
+    assert error.value.kind == "disconnected"

@@ -15,6 +15,7 @@ from nsm.pipeline import proposed_landmarks
 from nsm.pipeline.proposed_landmarks import asks_for_proposal, propose_landmarks
 from nsm.surfaces.landmark_files import read_pairs
 from nsm.surfaces.shapes import sphere
+from nsm.surfaces.validation import Repairs
 
 
 def meshes():
@@ -101,6 +102,21 @@ def test_shapes_without_a_proposal_are_mapped_without_landmarks_unless_asked(mon
     for strict, asked in ((True, False), (False, True)):
         with pytest.raises(NsmError):
             propose_landmarks(meshes(), strict, 0, asked, Console(quiet=True))
+
+
+def test_a_proposal_is_for_the_part_that_is_kept(monkeypatch):
+    answers(monkeypatch, 0.5)
+    vertices, faces = sphere()
+    both = (
+        np.concatenate([vertices, 0.3 * vertices + 5]),
+        np.concatenate([faces, faces + len(vertices)]),
+    )
+    shapes = [meshes()[0], Mesh("both", *both)]
+    console = Console(quiet=True)
+    with pytest.raises(NsmError) as refused:
+        propose_landmarks(shapes, False, 0, True, console)
+    assert refused.value.kind == "disconnected"
+    assert propose_landmarks(shapes, False, 0, True, console, Repairs("largest")) is not None
 
 
 def test_the_command_trains_with_them_and_leaves_the_file(here, tmp_path, monkeypatch):
