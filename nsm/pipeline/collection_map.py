@@ -34,6 +34,7 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_tears,
+    write_correspondences,
 )
 from nsm.results.metrics import evaluate
 from nsm.tasks import CollectionMap
@@ -201,6 +202,7 @@ class CollectionMapTask(Task):
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.welded_image)
         np.save(folder / "mapped_vertices.npy", image)
+        write_correspondences(folder / "correspondences.npz", f)
         vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
         export_surface(file, vertices, target.surface, f.source_uv)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from rich.text import Text
-from scipy.sparse import save_npz
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
@@ -37,6 +36,7 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     distortion_picture,
+    export_mesh,
     export_surface,
     isotopy_table,
     map_image,
@@ -44,9 +44,13 @@ from nsm.results import (
     morph_pictures,
     pair_metrics,
     pair_table,
+    reliability_picture,
     transfer_picture,
     warning_of_tears,
+    write_correspondences,
+    write_reliability,
 )
+from nsm.results.file_faces import faces_of_file
 from nsm.results.metrics import evaluate
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
@@ -252,14 +256,25 @@ class PairMapTask(Task):
         for name, mesh in meshes.items():
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
-        save_npz(folder / "source_to_target.npz", f.matrix())
-        (folder / "morph").mkdir(exist_ok=True)
-        for k in range(_MORPH_FRAMES):
-            frame = f.source.in_original_units(f.morph(k / (_MORPH_FRAMES - 1)))
-            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
+        write_correspondences(folder / "correspondences.npz", f)
+        write_reliability(folder / "reliability.ply", f)
+        reliability_picture(folder / "reliability.png", f)
+        _write_morph(folder, f)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_morph(folder: Path, f: SurfaceMap) -> None:
+    """The path from the source to its image, with the vertices and faces of the source's file."""
+    s = f.source.surface
+    faces, corners = faces_of_file(s)
+    uv = s.uv if s.domain.has_boundary else None
+    (folder / "morph").mkdir(exist_ok=True)
+    for k in range(_MORPH_FRAMES):
+        frame = f.morph(k / (_MORPH_FRAMES - 1))
+        export_mesh(folder / "morph" / f"{k:02d}.obj", frame, faces, uv, corners=corners)
+    f.export_morph(folder / "morph.glb")
 
 
 def _write_image(folder: Path, f: SurfaceMap) -> None:

@@ -99,14 +99,15 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
 def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> None:
     """The morph from source to target: five pictures in a row, and a GIF, back and forth."""
     s = f.source.surface
-    both = np.concatenate([s.vertices, f.aligned_image])
+    start, end = s.vertices, f.aligned_image
+    both = np.concatenate([start, end])
     frame = View(s.vertices, 8).frame
 
     def draw(t: float, size: int) -> np.ndarray:
         view = View(both, size, frame=frame)
-        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv), s.seam_pairs)).astype(
-            np.uint8
-        )
+        points = (1 - t) * start + t * end
+        picture = view.draw(points, s.faces, checked(s.uv), s.seam_pairs)
+        return np.round(255 * picture).astype(np.uint8)
 
     row = np.concatenate([draw(t, _STRIP) for t in np.linspace(0, 1, 5)], axis=1)
     data = io.BytesIO()

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from nsm.domains import Surface
 from nsm.results.certificate import Correction
-from nsm.results.points import check_points
+from nsm.results.points import as_points, check_points
 from nsm.surfaces.location import Places, locate
 
 if TYPE_CHECKING:
@@ -139,7 +139,9 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
     def like(array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float64, device=points.device)
 
-    places = _places(s, points, "points on the target" if back else "points on the source")
+    name = "points on the target" if back else "points on the source"
+    check_points(points, name, columns=_AXES)
+    places = located(s, points.detach().double().cpu().numpy(), name)
     corners = s.faces[places.face]
     if back:
         laid_out, reached = like(s.uv[corners]), image(None).double().to(points.device)
@@ -164,11 +166,15 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
     return through
 
 
-def _places(surface: Surface, points: Tensor, name: str) -> Places:
-    """Where points (N, 3), in the units of its file, are on a surface's mesh."""
-    check_points(points, name, columns=_AXES, finite=True)
+def located(surface: Surface, points: np.ndarray, name: str) -> Places:
+    """Where points (N, 3), in the units of its file, are on a surface's mesh.
+
+    Raises:
+        NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
+    """
+    points = as_points(points, 3, name)
     with np.errstate(over="ignore"):  # of points far away
-        normalised = (points.detach().double().cpu().numpy() - surface.center) * surface.scale
+        normalised = (points - surface.center) * surface.scale
     return locate(normalised, surface.vertices, surface.faces)
 
 

@@ -90,6 +90,10 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         "morph.png",
         "morph.gif",
         "morph/08.obj",
+        "morph.glb",
+        "correspondences.npz",
+        "reliability.ply",
+        "reliability.png",
     ):
         assert (folder / name).stat().st_size > 0, name
 
@@ -211,10 +215,11 @@ def test_a_file_with_copies_of_vertices_in_other_units(made, files, tmp_path):
 
 def test_a_morph_begins_at_the_source_and_ends_at_the_image(made):
     _, f = made
-    assert (f.morph(0.0) == f.source.surface.vertices).all()
-    end, image = f.morph(1.0), f.image
+    vertices, faces = f.source.file_mesh()
+    assert (f.morph(0.0) == vertices).all()
+    end, image = f.morph(1.0), f.welded_image / f.source.surface.scale
     # a rigid motion keeps all distances
-    edges = f.source.surface.faces[:, :2]
+    edges = faces[:, :2]
     lengths = [np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (end, image)]
     assert np.abs(lengths[0] - lengths[1]).max() < 1e-9
 
