@@ -262,6 +262,18 @@ def test_the_matrix_transfers(values):
     assert matrix.min() >= -1e-12
 
 
+@examples(10)
+@given(st.integers(-1, 50) | st.none() | st.floats())
+def test_spectra(count):
+    try:
+        values, functions = NEURAL[0].spectrum(count)
+    except NsmError:
+        assert type(count) is not int or not 1 <= count < VERTICES
+        return
+    assert values.shape == (count,) and functions.shape == (VERTICES, count)
+    assert abs(values[0]) < 1e-6 and (np.diff(values) > -1e-9).all()
+
+
 @examples(30)
 @given(ANY_FLOAT | st.integers(-2, 2) | st.none() | st.text(max_size=2) | st.complex_numbers())
 def test_morph(t):
@@ -696,6 +708,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "NeuralSurface.jacobian": [test_functions_of_the_domain, test_jacobians_are_differences],
     "NeuralSurface.file_mesh": [test_closed_surfaces_of_any_radii],
     "NeuralSurface.module": [test_modules_give_what_their_maps_give],
+    "NeuralSurface.spectrum": [test_spectra],
     "NeuralSurface.to": [test_functions_of_tensors],
     "NeuralSurface.value_and_jacobian": [
         test_functions_of_the_domain,
