@@ -117,10 +117,17 @@ class CollectionMapTask(Task):
         return f"{self.name} of {len(self.phis)} surfaces"
 
     def build(self) -> Any:
+        points, targets = self.points, self.targets
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
+            # as for pairs: the corners are key points (METHOD)
+            corners = torch.from_numpy(self.domain.corners).to(points)
+            points = torch.cat([points, corners])
+            kept = torch.stack([start.before(corners) for start in self.starts])
+            targets = torch.cat([targets, kept], dim=1)
         return self.module(
             **self.map_settings(),
-            points=self.points,
-            targets=self.targets,
+            points=points,
+            targets=targets,
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
             starts=self.starts,
             mesh=self._mesh(),

@@ -24,6 +24,13 @@ from nsm.surfaces.textures import read_texture
 
 QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
 MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'
+PENALTY = [
+    "constraints.boundary=penalty",
+    "constraints.landmarks=fixed",
+    "constraints.ramp=0",
+    "loss_weights.seam=0",
+    "loss_weights.triangles=0",
+]
 SEAM = "seam.path=shortest"
 POINTS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0.0]])
 
@@ -272,7 +279,7 @@ def on_the_square():
     return nsm.map_pair(
         "saddle",
         "plane",
-        overrides=[*QUICK, MADE, "domain=square", "constraints=paper_pair", "trainer.max_steps=60"],
+        overrides=[*QUICK, MADE, "domain=square", *PENALTY, "trainer.max_steps=60"],
         progress=False,
     )
 
