@@ -59,7 +59,6 @@ FORMS = {
         ("map.width=32", "map.depth=4", "trainer.max_steps=7000"),
         ("trainer.max_steps=7000",),
     ),
-    "tried": Form("two steps, to try the program", ("trainer.max_steps=2",), ("trainer.max_steps=2",)),
 }
 QUIET = ["logger=none", "artefacts=false", "trainer.progress=false", "domain=disc"]
 
@@ -167,9 +166,7 @@ def overfitted(store: Store, name: str, meshes: Path, form: Form, folder: Path) 
     return phi
 
 
-def mapped(
-    store: Store, phi: NeuralSurface, psi: NeuralSurface, meshes: Path, form: Form
-) -> None:
+def mapped(store: Store, phi: NeuralSurface, psi: NeuralSurface, meshes: Path, form: Form) -> None:
     """The map by the published recipe, and by default, each before and after its training."""
     files = [str(meshes / f"{name}.off") for name in (SOURCE, TARGET)]
     marks = [str(meshes / "landmarks" / f"{name}.vts") for name in (SOURCE, TARGET)]
