@@ -51,7 +51,8 @@ def planar_metrics(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> d
     Returns:
         median, mean and p95 of symmetric_dirichlet (METHOD, Eq. 2), conformal (Eq. 3),
         singular_value_ratio and area over the triangles, the mean weighted by their area on the
-        mesh; flipped_percent, of the minority's orientation; boundary_self_intersections: a map without flips can still overlap itself.
+        mesh; flipped_percent, of the minority's orientation; boundary_self_intersections:
+        a map without flips can still overlap itself.
     """
     source, image = triangle_metric(vertices, faces), triangle_metric(uv, faces)
     energies = (symmetric_dirichlet, conformal, singular_value_ratio, area)
