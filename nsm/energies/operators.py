@@ -201,7 +201,7 @@ def _check_degree(phi: Map) -> None:
     if any(getattr(part, "degree", None) == 2 for part in parts):
         warnings.warn(
             "second derivatives of a grid of degree 2 jump from cell to cell; train φ with "
-            "encoding.degree=3",
+            "encoding.degree=3, on a domain with boundary",
             stacklevel=3,
         )
 

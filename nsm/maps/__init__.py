@@ -9,7 +9,8 @@ from nsm.maps.encodings import Encoding, Identity, RandomFourierFeatures, Spline
 from nsm.maps.equivariant import EquivariantMap, TorusMap
 from nsm.maps.inverse import TransitionMap, inverted
 from nsm.maps.lattice_grid import LatticeSplineGrid
-from nsm.maps.networks import BLOCKS, NeuralMap, build_network, build_stored
+from nsm.maps.multilevel_spline import MultilevelSpline
+from nsm.maps.networks import BLOCKS, NeuralMap, PlanarNetwork, build_network, build_stored
 from nsm.maps.planar import DiscMap, IdentityInitializedMap, PlanarMap, SquareMap
 from nsm.maps.spline_field import SplineField
 from nsm.maps.tabulated import Remembered, Tabulated
@@ -29,9 +30,11 @@ __all__ = [
     "IdentityInitializedMap",
     "LatticeAligned",
     "LatticeSplineGrid",
+    "MultilevelSpline",
     "NeuralMap",
     "Placed",
     "PlanarMap",
+    "PlanarNetwork",
     "PointMap",
     "RandomFourierFeatures",
     "Remembered",

@@ -21,6 +21,7 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.map_metrics import flipped_percent
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
@@ -73,6 +74,10 @@ class ParamTask(Task):
         for name, uv in maps.items():
             result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
         result.metrics["nsm"].update(result.certificate)
+        if self.trained is not None:
+            result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(
+                self.trained.uv, surface.faces, mirrored=True
+            )
 
     def picture(self, module: Any) -> np.ndarray:
         uv = module(torch.as_tensor(self.surface.uv, dtype=torch.float32, device=module.device))
