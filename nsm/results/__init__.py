@@ -25,7 +25,7 @@ from nsm.results.pictures import (
     parameterization_picture,
     reconstruction_image,
 )
-from nsm.results.pointwise import SurfaceMapModule
+from nsm.results.pointwise import MapSequence, SurfaceMapModule
 from nsm.results.reliability import Reliability, reliability_picture, write_reliability
 from nsm.results.stored_map import load_surface_map
 from nsm.results.surface_map import SurfaceMap
@@ -54,6 +54,7 @@ __all__ = [
     "write_correspondences",
     "write_reliability",
     "SurfaceMap",
+    "MapSequence",
     "SurfaceMapModule",
     "TexturedMesh",
     "baked",

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
-from torch import Tensor, nn
+from torch import Tensor
 
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface
 from nsm.results.file_faces import FileFaces, same_mesh
 from nsm.results.files import atomic_write
 from nsm.results.points import as_points, as_values
+from nsm.results.pointwise import MapSequence
 from nsm.results.vertex_values import check_rows
 from nsm.surfaces.location import Places
 
@@ -90,9 +91,9 @@ class ComposedMap:
         """As :meth:`SurfaceMap.__matmul__`."""
         return composed(self, other)
 
-    def module(self) -> nn.Sequential:
+    def module(self) -> MapSequence:
         """The maps' modules (:meth:`SurfaceMap.module`), one after the other."""
-        return nn.Sequential(*(f.module() for f in self.maps))
+        return MapSequence(*(f.module() for f in self.maps))
 
     def to(self, device: torch.device | str) -> ComposedMap:
         """The same map with its networks on a device."""

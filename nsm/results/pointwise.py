@@ -9,7 +9,7 @@ of the piece, and jumps between pieces.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
@@ -95,6 +95,19 @@ class SurfaceMapModule(nn.Module):
         like = next(self.h.parameters(), torch.zeros(0))
         chosen = torch.as_tensor(uv if vertices is None else uv[vertices]).to(like)
         return cast(Tensor, self.h(chosen)).to(like.device)
+
+
+class MapSequence(nn.Sequential):
+    """Modules of maps one after the other, as ``(g @ f).module()`` makes it."""
+
+    def value_and_jacobian(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`SurfaceMapModule.value_and_jacobian`, by the chain rule."""
+        first, *others = cast(Iterable[SurfaceMapModule], self)
+        value, jacobian = first.value_and_jacobian(points)
+        for f in others:
+            value, own = f.value_and_jacobian(value)
+            jacobian = own @ jacobian
+        return value, jacobian
 
 
 def fixed_image(f: SurfaceMap) -> Image:
