@@ -133,8 +133,10 @@ def faces_of_file(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
 def _matched(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of (G, 3) and of (F, 3) with the same three numbers, none negative: pairs (M,), (M,)."""
     rows = np.sort(np.concatenate([there, here]), axis=1)
-    _, number = np.unique(rows, axis=0, return_inverse=True)
-    number = number.reshape(-1)
+    order = np.lexsort(rows.T)  # many times faster than np.unique of rows
+    differs = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    number = np.empty(len(rows), dtype=np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(differs)])
     usable = np.asarray((rows >= 0).all(axis=1))
     first = np.full(number.max() + 1, -1)
     mine = np.flatnonzero(usable[: len(there)])[::-1]  # the first of equal faces is taken
