@@ -81,7 +81,7 @@ OF_THE_TASK = {"energy._target_", "constraints.boundary"}
 
 
 def labelled(*files):
-    """Setting or chosen group -> whose it is, from the remarks of files in conf/, the last first."""
+    """Setting or chosen group -> whose it is, from the remarks of files in conf/."""
     found = {}
     for file in files:
         section = ""

@@ -51,6 +51,7 @@ from nsm.results import (
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
+from nsm.results.pair_pictures import normals_picture
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
     aligned,
@@ -272,6 +273,8 @@ class PairMapTask(Task):
             export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
+        if isinstance(f.target.map, AnalyticSurface):
+            normals_picture(folder / "normals.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
 
 

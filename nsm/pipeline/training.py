@@ -35,6 +35,7 @@ from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble
 
 CONFIG_FILE = "config.yaml"
+STRIP_FILE = "evolution.png"
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -165,7 +166,9 @@ def trained(
         )
     if config.logger:
         callbacks += [LearningRateMonitor(), Throughput(settings.log_every)]
-        callbacks += [pictures] if pictures else []
+    if pictures and (config.logger or config.artefacts):
+        pictures.strips = [run.folder / STRIP_FILE for run in runs] if config.artefacts else []
+        callbacks.append(pictures)
     module.log_every = settings.log_every
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))
