@@ -263,6 +263,9 @@ def _values(metrics: dict[str, float], columns: dict[str, str]) -> list[str]:
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
+    """A table in Markdown, without columns in which nothing is measured."""
+    kept = [k for k in range(len(head)) if k == 0 or any(row[k] != "–" for row in rows)]
+    head, rows = [head[k] for k in kept], [[row[k] for k in kept] for row in rows]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 

@@ -26,6 +26,7 @@ from nsm.pipeline.processes import Process, raised_by, shared_steps, take_over
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
 from nsm.results.divergence_guard import DivergenceGuard
+from nsm.results.evolution import EvolutionStrip
 from nsm.results.loggers import Distributed, build_loggers, close
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
@@ -35,7 +36,6 @@ from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble
 
 CONFIG_FILE = "config.yaml"
-STRIP_FILE = "evolution.png"
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -166,9 +166,10 @@ def trained(
         )
     if config.logger:
         callbacks += [LearningRateMonitor(), Throughput(settings.log_every)]
-    if pictures and (config.logger or config.artefacts):
-        pictures.strips = [run.folder / STRIP_FILE for run in runs] if config.artefacts else []
-        callbacks.append(pictures)
+        callbacks += [pictures] if pictures else []
+    if pictures and config.artefacts:
+        folders = [run.folder for run in runs]
+        callbacks.append(EvolutionStrip(pictures.draw, settings.log_pictures, folders))
     module.log_every = settings.log_every
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))

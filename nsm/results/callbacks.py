@@ -15,7 +15,6 @@ from pytorch_lightning.callbacks import Callback
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
-from nsm.results.evolution import extend_strip
 from nsm.results.files import flush_folder
 from nsm.results.loggers import log_picture, loggers_of, takes_pictures
 from nsm.tasks.ensemble import Ensemble, members
@@ -142,30 +141,13 @@ class Pictures(Callback):
         draw: from the module, or that of each of several trainings in one batch, to a picture
             (H, W, 3) uint8, or None.
         count: the number of pictures in all.
-
-    Attributes:
-        strips: files of the same pictures side by side (see :func:`extend_strip`), of each
-            training, with one of its start before them; none by default.
     """
 
     def __init__(self, name: str, draw: Callable[[Any], np.ndarray | None], count: int) -> None:
         self.name, self.draw, self.count, self.taken = name, draw, count, 0
-        self.strips: list[Path] = []
-
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if trainer.is_global_zero and trainer.global_step == 0 and self.strips and self.count:
-            for strip, module in zip(self.strips, members(pl_module).values(), strict=True):
-                self._add(strip, self.draw(module), 0)
-
-    @staticmethod
-    def _add(strip: Path, picture: np.ndarray | None, place: int) -> None:
-        if picture is not None:
-            extend_strip(strip, picture, place)
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if not trainer.is_global_zero:
-            return
-        if not self.strips and not takes_pictures(trainer.loggers):
+        if not trainer.is_global_zero or not takes_pictures(trainer.loggers):
             return
         share = trainer.global_step / max(1, trainer.max_steps)
         due = int(share * self.count)
@@ -177,8 +159,6 @@ class Pictures(Callback):
             if picture is not None:
                 loggers = loggers_of(trainer.loggers, index)
                 log_picture(loggers, self.name, picture, trainer.global_step)
-            if self.strips:
-                self._add(self.strips[index], picture, due)
 
     def state_dict(self) -> dict[str, Any]:
         return {"taken": self.taken}

@@ -38,8 +38,8 @@ class Spheres:
         self._count = len(vertices)
 
     def painted(self, paint: Callable[[Blend], np.ndarray]) -> Callable[[Blend], np.ndarray]:
-        """Colours for :meth:`nsm.results.render.View.draw` of ``mesh``: the mesh's, painted as it is
-        alone, and those of the spheres."""
+        """Colours for :meth:`nsm.results.render.View.draw` of ``mesh``: the mesh's, painted as
+        it is alone, and those of the spheres."""
 
         def colours(blend: Blend) -> np.ndarray:
             def of_mesh(values: np.ndarray) -> np.ndarray:
