@@ -37,7 +37,6 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     distortion_picture,
-    export_mesh,
     export_surface,
     isotopy_table,
     map_image,
@@ -284,8 +283,5 @@ def _write_image(folder: Path, f: SurfaceMap) -> None:
     image = f.target.in_original_units(f.welded_image)
     np.save(folder / "mapped_vertices.npy", image)
     points = f.target.in_original_units(weld.points)
-    export_surface(folder / "mapped.glb", points, s, s.uv)
-    if s.domain.has_boundary:
-        export_mesh(folder / "mapped.obj", image, weld.faces, s.uv, corners=weld.corners)
-    else:
-        export_surface(folder / "mapped.obj", points, s, s.uv)
+    for ending in (".obj", ".glb"):
+        export_surface(folder / f"mapped{ending}", points, s, s.uv)

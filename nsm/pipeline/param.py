@@ -15,9 +15,8 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     Parameterization,
-    checkerboard,
     comparison_table,
-    export_mesh,
+    export_surface,
     layout_image,
     parameterization_picture,
     planar_metrics,
@@ -88,9 +87,9 @@ class ParamTask(Task):
     def write_artefacts(self, folder: Path, result: Parameterization) -> None:
         surface = self.surface
         inside = _into_square(result.uv)
-        for ending, texture in (("obj", None), ("glb", checkerboard())):
-            file = folder / f"parameterized.{ending}"
-            export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
+        vertices = self.phi.in_original_units(surface.vertices)
+        for ending in (".obj", ".glb"):
+            export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
         write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
         energy = str(self.config.energy["_target_"]).rpartition(".")[2]
         before_after = {"before: domain Ω": surface.uv, f"after: {energy}": result.uv}

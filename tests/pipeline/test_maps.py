@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from rich.console import Console
+from tensor_checks import check_correspondences, check_tensors, check_weights
 
 import nsm
 from nsm.config import compose_config
@@ -161,7 +162,16 @@ def test_points_go_to_the_target_in_its_own_units(made, files):
 def test_points_may_be_tensors_that_a_gradient_is_wanted_of(made):
     _, f = made
     points = torch.tensor(f.source.in_original_units(f.source.surface.vertices[:5]))
-    assert np.array_equal(f(points.requires_grad_()), f(points.detach().numpy()))
+    image = f(points.requires_grad_())
+    assert image.requires_grad
+    assert np.allclose(image.detach().numpy(), f(points.detach().numpy()), rtol=0, atol=1e-9)
+
+
+def test_maps_of_cut_surfaces_take_tensors_and_correspond(made):
+    _, f = made
+    check_tensors(f)
+    check_weights(f)
+    check_correspondences(f)
 
 
 def test_results_are_shown_in_a_line(made, trio):
