@@ -242,9 +242,56 @@ def tables() -> str:
     if energies:
         parts.append("By the paper's two energies, flattening 384 and 384 → 388 (cut as a pair):")
         parts.append(table(["what", *BY_ENERGY.values(), "seconds"], energies))
+    if "energy: isometric map" in results:
+        parts.append("Baselines for 384 → 388:")
+        parts.append(baselines(results["energy: isometric map"]))
     parts.append("Flattening, beside libigl's methods on the same cut mesh:")
     parts.append(table(["surface", "method", *FLAT.values()], flat))
     return "\n\n".join(parts) + "\n"
+
+
+BASELINES = {
+    "symmetric_dirichlet_median": "median",
+    "symmetric_dirichlet_mean": "mean",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "after",
+    "landmark_error_max_percent": "landmark error, largest",
+}
+
+
+def baselines(default: dict[str, Any]) -> str:
+    """Maps of the study's pair by other means, beside the default's result.
+
+    A map that is not repaired has one share of flips. The published recipe cuts each shape by
+    itself, the default both together.
+    """
+    metrics = default["metrics"]
+    rows = [
+        ["nsm, default", *_values(metrics, BASELINES), f"{default['map_seconds']:.0f}"],
+        ["its parameterizations composed, no optimization", *_start(metrics), "–"],
+    ]
+    for file in sorted(RESULTS.parent.glob("published-*.json")):
+        found = json.loads(file.read_text())
+        for key, entry in found.items():
+            what, _, stage = key.partition("/")
+            if " → " not in what or stage == "default":
+                continue
+            told = {**entry["metrics"]}
+            told["flipped_before_repair_percent"] = told["flipped_percent"]
+            label = {
+                "before": "parameterizations of the published recipe composed, no optimization",
+                "published": f"{found['form']}, at its stop",
+            }.get(stage, f"{found['form']}, after the default's time")
+            rows.append([label, *_values(told, BASELINES), f"{entry['seconds']:.0f}"])
+    return table(["map", *BASELINES.values(), "seconds"], rows)
+
+
+def _start(metrics: dict[str, float]) -> list[str]:
+    """The figures of a map before its optimization, of which nothing is repaired."""
+    start = {key.removeprefix("start_"): v for key, v in metrics.items() if key[:6] == "start_"}
+    start["flipped_before_repair_percent"] = start["flipped_percent"]
+    return _values(start, BASELINES)
 
 
 def _flat_rows(case: str, methods: dict[str, dict[str, float]]) -> list[list[str]]:
