@@ -36,6 +36,7 @@ from nsm.results import (
     warning_of_tears,
     write_correspondences,
 )
+from nsm.results.collection_pictures import cycle_picture
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
@@ -214,6 +215,7 @@ class CollectionMapTask(Task):
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)
         transfer_matrix_picture(folder / "transfer.png", result)
+        cycle_picture(folder / "cycle.png", result)
         for i, source in enumerate(result.surfaces):
             for j, target in enumerate(result.surfaces):
                 if i != j:

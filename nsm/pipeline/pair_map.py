@@ -54,6 +54,7 @@ from nsm.results.file_faces import faces_of_file
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
+from nsm.results.pair_pictures import normals_picture
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
     aligned,
@@ -274,6 +275,8 @@ class PairMapTask(Task):
         _write_morph(folder, f)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
+        if isinstance(f.target.map, AnalyticSurface):
+            normals_picture(folder / "normals.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
 
 

@@ -91,7 +91,8 @@ class ParamTask(Task):
         for ending in (".obj", ".glb"):
             export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
         write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
-        before_after = {"before: domain Ω": surface.uv, "after": result.uv}
+        energy = str(self.config.energy["_target_"]).rpartition(".")[2]
+        before_after = {"before: domain Ω": surface.uv, f"after: {energy}": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
 

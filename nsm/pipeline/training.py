@@ -26,6 +26,7 @@ from nsm.pipeline.processes import Process, raised_by, shared_steps, take_over
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
 from nsm.results.divergence_guard import DivergenceGuard
+from nsm.results.evolution import EvolutionStrip
 from nsm.results.loggers import Distributed, build_loggers, close
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
@@ -166,6 +167,9 @@ def trained(
     if config.logger:
         callbacks += [LearningRateMonitor(), Throughput(settings.log_every)]
         callbacks += [pictures] if pictures else []
+    if pictures and config.artefacts:
+        folders = [run.folder for run in runs]
+        callbacks.append(EvolutionStrip(pictures.draw, settings.log_pictures, folders))
     module.log_every = settings.log_every
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))

@@ -16,8 +16,9 @@ from nsm.energies import symmetric_dirichlet
 from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
-from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
-from nsm.results.render import Blend, View
+from nsm.results.pictures import PANEL, by_normals, checked, panels, save_figure, vertex_means
+from nsm.results.render import Blend, View, vertex_normals
+from nsm.results.spheres import Spheres
 from nsm.results.surface_map import SurfaceMap
 
 _STRIP, _GIF = 300, 300
@@ -28,7 +29,8 @@ _TICKS = [_LEAST, 5, 7, 10, 20]
 def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     """The source's checkerboard and colours of position, beside both transferred to the target.
 
-    The target is drawn with its own triangles, aligned with the source.
+    The target is drawn with its own triangles, aligned with the source. Landmarks are spheres, of
+    one colour for the two of a pair.
     """
     s, t = f.source.surface, f.target.surface
     target = f.aligned(t.vertices)
@@ -38,10 +40,12 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
 
     def at_source(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        return left.draw(s.vertices, s.faces, paint, s.seam_pairs)
+        spheres = Spheres(s.vertices, s.faces, s.cut_vertex[f.landmarks[:, 0]])
+        return left.draw(*spheres.mesh, spheres.painted(paint), s.seam_pairs)
 
     def at_target(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        return right.draw(target, t.faces, paint, t.seam_pairs)
+        spheres = Spheres(target, t.faces, t.cut_vertex[f.landmarks[:, 1]])
+        return right.draw(*spheres.mesh, spheres.painted(paint), t.seam_pairs)
 
     rows = [
         [
@@ -54,6 +58,23 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
         ],
     ]
     save_figure(panels(*rows), path)
+
+
+def normals_picture(path: str | Path, f: SurfaceMap) -> None:
+    """The source coloured by its normals, and these colours transferred to the target, such as an
+    analytic surface: features that its shape does not have show where the source's come to lie."""
+    s, t = f.source.surface, f.target.surface
+    normals = vertex_normals(s.vertices, s.faces, s.seam_pairs)
+    left, right = View(s.vertices, PANEL), View(t.vertices, PANEL)
+    carried = f._back.take(normals, s.faces)
+    panel = [
+        (left.draw(s.vertices, s.faces, by_normals(normals), s.seam_pairs), f"{s.name}: normals"),
+        (
+            right.draw(t.vertices, t.faces, by_normals(carried), t.seam_pairs),
+            f"transferred to {t.name}",
+        ),
+    ]
+    save_figure(panels(panel), path)
 
 
 def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
