@@ -15,6 +15,8 @@ from nsm.surfaces.geometry import edge_graph
 _FACES = 1000
 _TIPS = 8
 _SAMPLES = 64
+_MOST = 9  # tips and given landmarks
+_NEAR = 0.15  # of a tip to a landmark that is given, over √area
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,9 @@ class CoarseShape:
         ids: (V,) the vertices of the given mesh that are left.
         distance: (V, V) geodesic, along edges.
         mean_distance: (V,) to all points of the surface.
-        tips: (K,) vertices far from everything, the most prominent first.
+        tips: (K,) vertices far from everything, the most prominent first; given ones before them.
         samples: (M,) vertices that are spread evenly.
+        given: how many of the tips are landmarks that were given.
     """
 
     vertices: np.ndarray
@@ -38,6 +41,12 @@ class CoarseShape:
     mean_distance: np.ndarray
     tips: np.ndarray
     samples: np.ndarray
+    given: int = 0
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """The vertices (given,) of landmarks that were given."""
+        return self.tips[: self.given]
 
     def spread_tips(self, count: int) -> np.ndarray:
         """Numbers of up to ``count`` tips that are far from each other."""
@@ -46,13 +55,17 @@ class CoarseShape:
 
 
 def coarse_shape(
-    vertices: np.ndarray, faces: np.ndarray, tips: np.ndarray | None = None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    tips: np.ndarray | None = None,
+    fixed: np.ndarray | None = None,
 ) -> CoarseShape:
     """The coarse shape of a closed mesh (V, 3), (F, 3) of genus 0.
 
     Args:
         vertices, faces: the mesh.
         tips: (K,) vertices that stand for the tips, which are found if not given.
+        fixed: (G,) vertices, landmarks that are given; tips near them are left out.
 
     Raises:
         NsmError: ``wrong_topology`` for any other mesh; ``no_proposal`` for one with fewer than
@@ -69,7 +82,13 @@ def coarse_shape(
             kind="wrong_topology",
             key="landmarks",
         )
-    tips = extremities(vertices, faces, _TIPS) if tips is None else tips
+    given = 0 if fixed is None else len(fixed)
+    if tips is None:
+        tips = extremities(vertices, faces, _TIPS)
+        if fixed is not None and given:
+            unit = np.sqrt(topology.face_areas(vertices, faces).sum())
+            apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
+            tips = np.concatenate([fixed, tips[apart > _NEAR][: _MOST - given]])
     if len(tips) < 4:
         raise NsmError(
             f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",
@@ -91,6 +110,7 @@ def coarse_shape(
         distance @ corner,
         tips,
         _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
+        given,
     )
 
 

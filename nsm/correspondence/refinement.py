@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -49,6 +50,22 @@ class Sines:
         return np.stack([sine, cosine * self.waves[:, 0], cosine * self.waves[:, 1]])
 
 
+class Anchors(NamedTuple):
+    """Points that maps of a batch draw together.
+
+    Attributes:
+        points: (G, 2) of the source's Ω.
+        places: (H, G, 2) of each map's target, in any lift.
+        shapes: (H, 2, 2) of each target's plane: distances are those of ``shape @ x``.
+        weight: of the squared distance, beside the energy.
+    """
+
+    points: np.ndarray
+    places: np.ndarray
+    shapes: np.ndarray
+    weight: float
+
+
 class Batch:
     """Maps h of one source's layout to targets, x ↦ B (x + n(x)) + c, and their energies.
 
@@ -59,6 +76,7 @@ class Batch:
         matrices: B (H, 2, 2).
         shifts: c (H, 2).
         largest: of the waves.
+        anchors: points that the maps draw together.
     """
 
     def __init__(
@@ -69,6 +87,7 @@ class Batch:
         matrices: np.ndarray,
         shifts: np.ndarray,
         largest: int,
+        anchors: Anchors | None = None,
     ) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=torch.float32)
@@ -80,6 +99,28 @@ class Batch:
         self.log_metric = tensor(np.stack([t.log_metric for t in tables]))
         self.number = torch.as_tensor(number)
         self.matrices, self.shifts = tensor(matrices), tensor(shifts)
+        self.weight = 0.0 if anchors is None else anchors.weight
+        if anchors is not None:
+            self.anchor_basis = tensor(Sines.up_to(largest).basis(anchors.points)[0])
+            self.anchors, self.places = tensor(anchors.points), tensor(anchors.places)
+            self.shapes = tensor(anchors.shapes)
+
+    def losses(self, amplitudes: Tensor) -> Tensor:
+        """The energies (H,), and what anchors add to them."""
+        energy = self.energies(amplitudes)
+        return energy + self.weight * self.gaps(amplitudes) if self.weight else energy
+
+    def gaps(self, amplitudes: Tensor) -> Tensor:
+        """Sum (H,) of the squared distances of anchors' images to the nearest lifts of places."""
+        basis = self.anchor_basis[:, : amplitudes.shape[1]]
+        h = self.anchors + torch.einsum("gk,hkc->hgc", basis, amplitudes)
+        image = torch.einsum("hij,hgj->hgi", self.matrices, h) + self.shifts[:, None]
+        squared = []
+        for sign in (1, -1):
+            off = image - sign * self.places
+            off = off - 2 * torch.round(off.detach() / 2)
+            squared.append((torch.einsum("hij,hgj->hgi", self.shapes, off) ** 2).sum(dim=-1))
+        return torch.minimum(*squared).sum(dim=-1)
 
     def energies(self, amplitudes: Tensor) -> Tensor:
         """Mean symmetric Dirichlet energy (H,) of maps with amplitudes (H, K, 2)."""
@@ -117,16 +158,16 @@ class Batch:
 
 
 def refined(batch: Batch, amplitudes: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Lower the energies of all maps of a batch by L-BFGS, each with its own step lengths.
+    """Lower the losses of all maps of a batch by L-BFGS, each with its own step lengths.
 
     Returns:
-        the amplitudes (H, K, 2), and the energies (H,).
+        the amplitudes (H, K, 2), and the losses (H,).
     """
     shape = amplitudes.shape
 
     def evaluated(x: Tensor) -> tuple[Tensor, Tensor]:
         x = x.detach().requires_grad_(True)
-        value = batch.energies(x.view(shape))
+        value = batch.losses(x.view(shape))
         (gradient,) = torch.autograd.grad(value.sum(), x)
         return value.detach(), gradient.nan_to_num()
 

@@ -17,12 +17,14 @@ import torch
 
 from nsm.correspondence.coarse_shape import CoarseShape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
-from nsm.correspondence.refinement import Batch, Sines, refined
+from nsm.correspondence.refinement import Anchors, Batch, Sines, refined
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
+from nsm.errors import NsmError
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
+_HOLD = 50.0  # weight of the squared distance, over the area, by which a map misses a landmark
 
 
 @dataclass(frozen=True)
@@ -70,18 +72,30 @@ class Candidate:
 
     def cones(self) -> np.ndarray:
         """The tips at the cones of the source, and those that they go to: (4, 2) vertices."""
+        numbers = self.cone_numbers()
+        tips = self.source.shape.tips[numbers[:, 0]], self.target.shape.tips[numbers[:, 1]]
+        return np.stack(tips, axis=1)
+
+    def cone_numbers(self) -> np.ndarray:
+        """The same as numbers (4, 2) among the tips."""
         image = SIDE * group.CONES @ self.matrix.T + self.shift
         corner = np.mod(np.rint(image).astype(int), 2)
         wanted = np.rint(SIDE * group.CONES).astype(int)
         at = [int(np.flatnonzero((wanted == c).all(axis=1))[0]) for c in corner]
-        ours, theirs = self.source, self.target
-        return np.stack([ours.shape.tips[ours.tips], theirs.shape.tips[theirs.tips[at]]], axis=1)
+        return np.stack([self.source.tips, self.target.tips[at]], axis=1)
 
 
 def candidates(
     source: CoarseShape, target: CoarseShape, rounds: Sequence[Round] = ROUNDS
 ) -> list[Candidate]:
-    """Maps of the source to the target that may be right, least distorted first."""
+    """Maps of the source to the target that may be right, least distorted first.
+
+    Landmarks that are given on both shapes are held: a map does not take one to another tip, and
+    what it misses them by is added to its energy.
+
+    Raises:
+        NsmError: ``no_proposal``: no map meets the landmarks that are given.
+    """
     sets, scores = quick_scores(source)
     ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]])
     theirs = _laid_out(target, _similar_sets(ours, target))
@@ -92,21 +106,29 @@ def candidates(
         for t, looked_up in zip(theirs, tables, strict=True)
         for candidate in _starts(s, t, looked_up)
     ]
+    if not found:
+        raise NsmError(
+            "no map of the surfaces meets the landmarks; give others, or more",
+            kind="no_proposal",
+            key="landmarks",
+        )
+    held = np.stack([source.fixed, target.fixed], axis=1)
     for one in rounds:
-        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one)
+        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held)
     return sorted(found, key=lambda c: c.cost)
 
 
-def distance_change(candidate: Candidate) -> float:
-    """Mean difference of geodesic distances between samples and between their images."""
+def missed(candidate: Candidate) -> np.ndarray:
+    """Distances (G,) from the images of landmarks that are given to where they should be."""
     s, t = candidate.source.shape, candidate.target.shape
-    return float(_changes(s, t, candidate.images(s.samples)))
+    return np.asarray(t.distance[candidate.images(s.fixed), t.fixed])
 
 
-def rigid_residual(candidate: Candidate) -> float:
-    """Root mean square distance of samples, moved rigidly, to their images."""
-    s, t = candidate.source.shape, candidate.target.shape
-    p, q = s.vertices[s.samples], t.vertices[candidate.images(s.samples)]
+def rigid_residual(
+    source: CoarseShape, points: np.ndarray, target: CoarseShape, images: np.ndarray
+) -> float:
+    """Root mean square distance of vertices (N,), moved rigidly, to their images (N,)."""
+    p, q = source.vertices[points], target.vertices[images]
     p, q = p - p.mean(axis=0), q - q.mean(axis=0)
     left, _, right = np.linalg.svd(p.T @ q)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
@@ -122,17 +144,23 @@ def _similar_sets(ours: Sequence[Layout], target: CoarseShape) -> np.ndarray:
     """Sets (S, 4) of the target's tips whose distances are those of one of the source's sets."""
     apart = target.distance[np.ix_(target.tips, target.tips)]
     mean = target.mean_distance[target.tips]
-    orders = np.array(list(permutations(range(len(target.tips)), 4)))
+    every = np.array(list(permutations(range(len(target.tips)), 4)))
     rows, columns = np.triu_indices(4, 1)
     best: dict[tuple[int, ...], float] = {}
     for one in ours:
         shape, tips = one.shape, one.shape.tips[one.tips]
+        orders = every[_agree(one.tips, every, target.given).all(axis=1)]
         wanted = shape.distance[tips[rows], tips[columns]]
         cost = np.abs(wanted - apart[orders[:, rows], orders[:, columns]]).mean(axis=1)
         cost += np.abs(shape.mean_distance[tips] - mean[orders]).mean(axis=1)
         for value, four in zip(cost.tolist(), np.sort(orders, axis=1).tolist(), strict=True):
             best[tuple(four)] = min(best.get(tuple(four), np.inf), value)
-    return np.array(sorted(best, key=lambda four: best[four])[:_TARGET_SETS])
+    return np.array(sorted(best, key=lambda four: best[four])[:_TARGET_SETS]).reshape(-1, 4)
+
+
+def _agree(ours: np.ndarray, theirs: np.ndarray, given: int) -> np.ndarray:
+    """Whether tips, by their numbers, may correspond: a given landmark only to itself."""
+    return np.asarray((ours == theirs) | ((ours >= given) & (theirs >= given)))
 
 
 def _starts(source: Layout, target: Layout, looked_up: Table) -> list[Candidate]:
@@ -142,20 +170,37 @@ def _starts(source: Layout, target: Layout, looked_up: Table) -> list[Candidate]
         Candidate(source, target, looked_up, matrix, shift, 0, nothing, 0.0)
         for matrix, shift in affine_maps(source, target)
     ]
+    given = source.shape.given
+    made = [c for c in made if _agree(*c.cone_numbers().T, given).all()]
+    if not made:
+        return []
     images = np.stack([candidate.images(source.shape.samples) for candidate in made])
-    costs = _changes(source.shape, target.shape, images)
+    costs = changes(source.shape, source.shape.samples, target.shape, images)
+    if given:
+        costs = costs + np.array([missed(c).mean() for c in made])
     return [replace(c, cost=float(cost)) for c, cost in zip(made, costs, strict=True)]
 
 
-def _changes(source: CoarseShape, target: CoarseShape, images: np.ndarray) -> np.ndarray:
-    """Mean difference (...) of distances between samples and between images (..., M) of them."""
-    before = source.distance[np.ix_(source.samples, source.samples)]
+def changes(
+    source: CoarseShape, points: np.ndarray, target: CoarseShape, images: np.ndarray
+) -> np.ndarray:
+    """Mean difference (...) of geodesic distances between vertices (N,) and between images (..., N)
+    of them."""
+    before = source.distance[np.ix_(points, points)]
     after = target.distance[images[..., :, None], images[..., None, :]]
     return np.asarray(np.abs(before - after).mean(axis=(-1, -2)))
 
 
-def trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
-    """The candidates after a round of trainings; those of one source's layout in one batch."""
+def trained(
+    found: Sequence[Candidate], one: Round, held: np.ndarray | None = None
+) -> list[Candidate]:
+    """The candidates after a round of trainings; those of one source's layout in one batch.
+
+    Args:
+        found: the candidates.
+        one: the round.
+        held: (G, 2) vertices of source and target that are drawn together; none by default.
+    """
     waves = len(Sines.up_to(one.largest).waves)
     by_source: dict[int, list[Candidate]] = {}
     for candidate in found:
@@ -171,11 +216,13 @@ def trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
             np.stack([c.matrix for c in group_]),
             np.stack([c.shift for c in group_]),
             one.largest,
+            _anchors(group_[0].source, group_, held),
         )
         start = torch.zeros(len(group_), waves, 2)
         for k, candidate in enumerate(group_):  # few waves come first among many
             start[k, : len(candidate.amplitudes)] = torch.as_tensor(candidate.amplitudes)
-        amplitudes, energies = refined(batch, start, one.steps)
+        amplitudes, _ = refined(batch, start, one.steps)
+        energies = batch.energies(amplitudes)
         result += [
             replace(c, largest=one.largest, amplitudes=a, cost=e)
             for c, a, e in zip(
@@ -183,3 +230,14 @@ def trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
             )
         ]
     return result
+
+
+def _anchors(
+    source: Layout, found: Sequence[Candidate], held: np.ndarray | None
+) -> Anchors | None:
+    if held is None or not len(held):
+        return None
+    targets = [candidate.target.embedding for candidate in found]
+    shapes = [t.lattice / SIDE / np.sqrt(t.area) for t in targets]
+    places = [t.uv[held[:, 1]] for t in targets]
+    return Anchors(source.embedding.uv[held[:, 0]], np.stack(places), np.stack(shapes), _HOLD)
