@@ -66,6 +66,20 @@ class Anchors(NamedTuple):
     weight: float
 
 
+class Directions(NamedTuple):
+    """Unit normals that maps of a batch should take to one another.
+
+    Attributes:
+        source: (H, N, 3) at each triangle of the source, turned into the pose of each target.
+        tables: (T, C, C, 3) of the targets, over their grids.
+        weight: of 1 - cos of the angle between them, beside the energy.
+    """
+
+    source: np.ndarray
+    tables: np.ndarray
+    weight: float
+
+
 class Batch:
     """Maps h of one source's layout to targets, x ↦ B (x + n(x)) + c, and their energies.
 
@@ -77,6 +91,7 @@ class Batch:
         shifts: c (H, 2).
         largest: of the waves.
         anchors: points that the maps draw together.
+        directions: normals that they take to one another.
     """
 
     def __init__(
@@ -88,6 +103,7 @@ class Batch:
         shifts: np.ndarray,
         largest: int,
         anchors: Anchors | None = None,
+        directions: Directions | None = None,
     ) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=torch.float32)
@@ -104,11 +120,26 @@ class Batch:
             self.anchor_basis = tensor(Sines.up_to(largest).basis(anchors.points)[0])
             self.anchors, self.places = tensor(anchors.points), tensor(anchors.places)
             self.shapes = tensor(anchors.shapes)
+        self.directed = 0.0 if directions is None else directions.weight
+        if directions is not None:
+            self.normals, self.normal_tables = tensor(directions.source), tensor(directions.tables)
 
     def losses(self, amplitudes: Tensor) -> Tensor:
-        """The energies (H,), and what anchors add to them."""
-        energy = self.energies(amplitudes)
-        return energy + self.weight * self.gaps(amplitudes) if self.weight else energy
+        """The energies (H,), and what anchors and directions add to them."""
+        loss = self.energies(amplitudes)
+        if self.weight:
+            loss = loss + self.weight * self.gaps(amplitudes)
+        if self.directed:
+            loss = loss + self.directed * self.turns(amplitudes)
+        return loss
+
+    def turns(self, amplitudes: Tensor) -> Tensor:
+        """Mean 1 - cos (H,) of the angles between normals and those at the images."""
+        basis = self.basis[0][:, : amplitudes.shape[1]]
+        h = self.at + torch.einsum("nk,hkc->hnc", basis, amplitudes)
+        image = torch.einsum("hij,hnj->hni", self.matrices, h) + self.shifts[:, None]
+        off = self._interpolated(self.normal_tables, image) - self.normals
+        return 0.5 * (off**2).sum(dim=-1) @ self.area
 
     def gaps(self, amplitudes: Tensor) -> Tensor:
         """Sum (H,) of the squared distances of anchors' images to the nearest lifts of places."""
@@ -128,7 +159,7 @@ class Batch:
         j = stack[1:].permute(1, 2, 3, 0) + torch.eye(2)  # (H, N, 2, 2): component, direction
         h = self.at + stack[0]
         image = torch.einsum("hij,hnj->hni", self.matrices, h) + self.shifts[:, None]
-        metric = _exponential(self._interpolated(image))
+        metric = _exponential(self._interpolated(self.log_metric, image))
         whole = torch.einsum("hij,hnjk->hnik", self.matrices, j)
         pulled = whole.mT @ metric @ whole
         trace = torch.einsum("nij,hnij->hn", self.inverse, pulled)
@@ -141,9 +172,9 @@ class Batch:
         energy = torch.where(large, _CAPPED * (1 + torch.log(energy / _CAPPED)), energy)
         return energy @ self.area
 
-    def _interpolated(self, points: Tensor) -> Tensor:
-        """Logarithms of the metric (H, N, 3) at points (H, N, 2), bilinear in the table."""
-        n = self.log_metric.shape[1]
+    def _interpolated(self, grid: Tensor, points: Tensor) -> Tensor:
+        """Values (H, N, 3) of tables (T, C, C, 3) at points (H, N, 2), bilinear."""
+        n = grid.shape[1]
         t = 0.5 * n * points
         cell = torch.floor(t.detach())
         f = (t - cell)[..., None, :]
@@ -151,7 +182,6 @@ class Batch:
         k, m = (i + 1) % n, (j + 1) % n
         number = self.number[:, None]
         u, v = f[..., 0], f[..., 1]
-        grid = self.log_metric
         near = (1 - v) * grid[number, i, j] + v * grid[number, i, m]
         far = (1 - v) * grid[number, k, j] + v * grid[number, k, m]
         return (1 - u) * near + u * far

@@ -17,26 +17,32 @@ import torch
 
 from nsm.correspondence.coarse_shape import CoarseShape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
-from nsm.correspondence.refinement import Anchors, Batch, Sines, refined
+from nsm.correspondence.refinement import Anchors, Batch, Directions, Sines, refined
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
 from nsm.errors import NsmError
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
+_DIRECTED = 40.0  # weight of 1 - cos of the angle between normals, beside the energy
 _HOLD = 50.0  # weight of the squared distance, over the area, by which a map misses a landmark
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of trainings: how many maps, their largest wave, and steps."""
+    """One round of trainings: how many maps, their largest wave, steps, and whether normals count.
+
+    Normals count in the pose that a map gives, so only once it is near its end.
+    """
 
     maps: int
     largest: int
     steps: int
+    directed: bool = False
 
 
-ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40))
+_LAST = Round(16, 8, 20, directed=True)
+ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40), _LAST, _LAST)
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,8 @@ class Candidate:
         matrix, shift: B (2, 2) and c (2,), in coordinates of Ω.
         largest: of the waves of n.
         amplitudes: (K, 2) of the waves.
-        cost: what orders candidates: of the last round the mean symmetric Dirichlet energy.
+        cost: what orders candidates; after a training its loss.
+        energy: after a training, the mean symmetric Dirichlet energy.
     """
 
     source: Layout
@@ -60,6 +67,7 @@ class Candidate:
     largest: int
     amplitudes: np.ndarray
     cost: float
+    energy: float = np.inf
 
     def planar(self, x: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the source's Ω to points (N, 2) of the target's."""
@@ -130,9 +138,23 @@ def rigid_residual(
     """Root mean square distance of vertices (N,), moved rigidly, to their images (N,)."""
     p, q = source.vertices[points], target.vertices[images]
     p, q = p - p.mean(axis=0), q - q.mean(axis=0)
-    left, _, right = np.linalg.svd(p.T @ q)
+    return float(np.sqrt(((p @ pose(p, q) - q) ** 2).sum(axis=1).mean()))
+
+
+def pose(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """The rotation R (3, 3) for which points p R (N, 3), about their mean, are nearest to q."""
+    left, _, right = np.linalg.svd((p - p.mean(axis=0)).T @ (q - q.mean(axis=0)))
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return float(np.sqrt(((p @ left @ flip @ right - q) ** 2).sum(axis=1).mean()))
+    return np.asarray(left @ flip @ right)
+
+
+def turned(candidate: Candidate) -> float:
+    """Mean 1 - cos of the angles between normals at samples, moved rigidly, and at their images."""
+    s, t = candidate.source.shape, candidate.target.shape
+    images = candidate.images(s.samples)
+    turn = pose(s.vertices[s.samples], t.vertices[images])
+    cosine = ((s.normals[s.samples] @ turn) * t.normals[images]).sum(axis=1)
+    return float(1 - cosine.mean())
 
 
 def _laid_out(shape: CoarseShape, sets: np.ndarray) -> list[Layout]:
@@ -217,16 +239,21 @@ def trained(
             np.stack([c.shift for c in group_]),
             one.largest,
             _anchors(group_[0].source, group_, held),
+            _directions(group_[0].source, group_, tables) if one.directed else None,
         )
         start = torch.zeros(len(group_), waves, 2)
         for k, candidate in enumerate(group_):  # few waves come first among many
             start[k, : len(candidate.amplitudes)] = torch.as_tensor(candidate.amplitudes)
         amplitudes, _ = refined(batch, start, one.steps)
-        energies = batch.energies(amplitudes)
+        energies, losses = batch.energies(amplitudes), batch.losses(amplitudes)
         result += [
-            replace(c, largest=one.largest, amplitudes=a, cost=e)
-            for c, a, e in zip(
-                group_, amplitudes.numpy().astype(float), energies.tolist(), strict=True
+            replace(c, largest=one.largest, amplitudes=a, energy=e, cost=cost)
+            for c, a, e, cost in zip(
+                group_,
+                amplitudes.numpy().astype(float),
+                energies.tolist(),
+                losses.tolist(),
+                strict=True,
             )
         ]
     return result
@@ -241,3 +268,16 @@ def _anchors(
     shapes = [t.lattice / SIDE / np.sqrt(t.area) for t in targets]
     places = [t.uv[held[:, 1]] for t in targets]
     return Anchors(source.embedding.uv[held[:, 0]], np.stack(places), np.stack(shapes), _HOLD)
+
+
+def _directions(source: Layout, found: Sequence[Candidate], tables: Sequence[Table]) -> Directions:
+    """The source's normals in the pose that each candidate gives, and the targets' normals."""
+    shape, target = source.shape, found[0].target.shape
+    normals = shape.normals[shape.faces].mean(axis=1)
+    points = shape.vertices[shape.samples]
+    turned_ = [
+        normals @ pose(points, target.vertices[candidate.images(shape.samples)])
+        for candidate in found
+    ]
+    grids = np.stack([target.normals[one.vertex] for one in tables])
+    return Directions(np.stack(turned_), grids, _DIRECTED)
