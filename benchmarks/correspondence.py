@@ -114,8 +114,8 @@ def without(source: Annotated, target: Annotated, given: int = 0) -> dict[str, A
     return {
         "errors": each[0],
         "best alternative": min(float(e.mean()) for e in each),
-        "margin": min(proposal.margin, 9.0),
-        "score": proposal.hypotheses[0].score,
+        "margin": float(min(proposal.margin, 9.0)),
+        "score": float(proposal.hypotheses[0].score),
         "sure": proposal.sure,
     }
 
@@ -161,10 +161,13 @@ def measured(row: str, source: Annotated, target: Annotated) -> dict[str, Any]:
     found = ROWS[row](source, target)
     found["seconds"] = time.process_time() - start
     found["mean"] = float(np.mean(found["errors"]))
-    return {
-        key: round(value, 4) if isinstance(value, float) else np.asarray(value).round(4).tolist()
-        for key, value in found.items()
-    }
+    return {key: _rounded(value) for key, value in found.items()}
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 4)
+    return value.round(4).tolist() if isinstance(value, np.ndarray) else value
 
 
 def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
@@ -196,7 +199,9 @@ def draw(lines: list[dict[str, Any]]) -> None:
 
     figure, axes = plt.subplots(figsize=(6, 4))
     for row in ROWS:
-        chosen = [line["errors"] for line in lines if (line["row"], line["kind"]) == (row, "animals")]
+        chosen = [
+            line["errors"] for line in lines if (line["row"], line["kind"]) == (row, "animals")
+        ]
         if chosen:
             every = np.sort(np.concatenate([np.array(e) for e in chosen]))
             share = 100 * np.arange(1, len(every) + 1) / len(every)

@@ -18,7 +18,6 @@ from nsm.correspondence.layouts import quick_scores
 from nsm.correspondence.proposal import (
     LARGEST_SCORE,
     LEAST_MARGIN,
-    NONE,
     Hypothesis,
     compared,
     hypotheses,
@@ -26,6 +25,10 @@ from nsm.correspondence.proposal import (
 
 _LEAST = 4  # landmarks, for common cones
 _KEPT = 5
+
+Choice = dict[int, int]  # of each member the number of its hypothesis
+Scores = dict[int, np.ndarray]  # (H,) of each member
+PairScores = dict[tuple[int, int], np.ndarray]  # (H, H') of two members
 
 
 @dataclass(frozen=True)
@@ -87,10 +90,7 @@ def proposed_for_all(
         [(best + rise) / len(others) for rise in (0.0, *(r for r, _ in changed[: _KEPT - 1]))],
         float(margin),
         len(fixed),
-        bool(
-            margin > LEAST_MARGIN
-            and all(own[i][n] < LARGEST_SCORE for i, n in chosen.items())
-        ),
+        bool(margin > LEAST_MARGIN and all(own[i][n] < LARGEST_SCORE for i, n in chosen.items())),
     )
 
 
@@ -103,20 +103,17 @@ def _between(first: Hypothesis, second: Hypothesis) -> float:
     """The score, without energy, of the map between the targets of two maps of one source."""
     a, b = first.candidate, second.candidate
     samples = a.source.shape.samples
-    return compared(
-        a.target.shape, a.images(samples), b.target.shape, b.images(samples)
-    )
+    return compared(a.target.shape, a.images(samples), b.target.shape, b.images(samples))
 
 
-Choice = dict[int, int]
-
-
-def _total(own: dict[int, np.ndarray], between: dict[tuple[int, int], np.ndarray], c: Choice) -> float:
+def _total(
+    own: dict[int, np.ndarray], between: dict[tuple[int, int], np.ndarray], c: Choice
+) -> float:
     alone = sum(float(scores[c[i]]) for i, scores in own.items())
     return alone + sum(float(cost[c[i], c[j]]) for (i, j), cost in between.items())
 
 
-def _least(own: dict[int, np.ndarray], between: dict[tuple[int, int], np.ndarray]) -> Choice:
+def _least(own: Scores, between: PairScores) -> Choice:
     """The choice that no other choice of one member betters, from the members' own best ones."""
     chosen = {i: int(scores.argmin()) for i, scores in own.items()}
     while True:
@@ -128,9 +125,7 @@ def _least(own: dict[int, np.ndarray], between: dict[tuple[int, int], np.ndarray
         chosen = best
 
 
-def _landmarks(
-    shapes: Sequence[CoarseShape], hub: int, taken: dict[int, Hypothesis]
-) -> np.ndarray:
+def _landmarks(shapes: Sequence[CoarseShape], hub: int, taken: dict[int, Hypothesis]) -> np.ndarray:
     """Landmarks (L, k): given ones, and the hub's tips that correspond to tips of all others.
 
     Where these are fewer than four, tips come in that correspond to those of most others; on the

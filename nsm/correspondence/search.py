@@ -259,9 +259,7 @@ def trained(
     return result
 
 
-def _anchors(
-    source: Layout, found: Sequence[Candidate], held: np.ndarray | None
-) -> Anchors | None:
+def _anchors(source: Layout, found: Sequence[Candidate], held: np.ndarray | None) -> Anchors | None:
     if held is None or not len(held):
         return None
     targets = [candidate.target.embedding for candidate in found]

@@ -32,8 +32,8 @@ def meshes():
 def answers(monkeypatch, margin, score=2.0):
     """Let the search answer with two hypotheses, in the numbers of cleaned meshes."""
     found = [
-        Hypothesis(np.array([[k, 10 + k] for k in range(first, first + 4)]), s, 5.0, 0, 0, 0, 0, None)
-        for first, s in ((0, score), (20, score + margin))
+        Hypothesis(np.array([[k, 10 + k] for k in range(n, n + 4)]), s, 5.0, 0, 0, 0, 0, None)
+        for n, s in ((0, score), (20, score + margin))
     ]
 
     def completed(source, target, given):
@@ -109,11 +109,9 @@ def test_one_to_four_given_landmarks_are_kept_and_completed(count, monkeypatch):
     assert ids[0] == [*range(100, 100 + count), 0, 1, 2, 3]
     assert ids[1] == [*range(201, 201 + count), 11, 12, 13, 14]
     assert f"{count} given" in said and f'"given": {count}' in found.to_json()
-    for words in ({"words": ["proposal.complete=false"]}, {"words": [], "domain": DISC}):
-        assert take(pairs, *words.pop("words"), **words)[:2] == (
-            [[p[0] for p in pairs], [p[1] for p in pairs]],
-            None,
-        )
+    alone = ([[p[0] for p in pairs], [p[1] for p in pairs]], None)
+    assert take(pairs, "proposal.complete=false")[:2] == alone
+    assert take(pairs, domain=DISC)[:2] == alone
 
 
 def test_unsure_ones_complete_fewer_than_four_only(monkeypatch):
