@@ -193,7 +193,8 @@ def _starts(source: Layout, target: Layout, looked_up: Table) -> list[Candidate]
         for matrix, shift in affine_maps(source, target)
     ]
     given = source.shape.given
-    made = [c for c in made if _agree(*c.cone_numbers().T, given).all()]
+    numbers = [candidate.cone_numbers() for candidate in made]
+    made = [c for c, n in zip(made, numbers, strict=True) if _agree(n[:, 0], n[:, 1], given).all()]
     if not made:
         return []
     images = np.stack([candidate.images(source.shape.samples) for candidate in made])

@@ -155,7 +155,7 @@ def test_anchors_are_drawn_to_the_nearest_of_all_lifts():
     added = (batch.losses(given_) - batch.energies(given_)).item()
     assert added == pytest.approx(7 * expected, rel=1e-3)
     drawn, _ = refined(batch, torch.zeros(1, 12, 2), 100)
-    assert batch.gaps(drawn).item() < 0.3 * batch.gaps(torch.zeros(1, 12, 2)).item()
+    assert batch.gaps(drawn).item() < 0.5 * batch.gaps(torch.zeros(1, 12, 2)).item()
 
 
 @given(st.floats(0, np.pi))
