@@ -247,14 +247,17 @@ class AttributesSettings:
 
 @dataclass
 class ProposalSettings:
-    """What happens to landmarks that landmarks=auto proposes.
+    """What happens to landmarks that nsm proposes for closed meshes of genus 0.
 
     Args:
         strict: end with an error where the proposal is not sure, before any training.
         alternative: which proposal is taken: 0 the best, 1 the second best.
+        complete: one to four given landmarks are completed by proposed ones; to four, only where
+            these are sure.
     """
 
     strict: bool = False
+    complete: bool = True
     alternative: Whole = 0
 
 
@@ -446,7 +449,8 @@ class Settings:
             .json, one for each surface, or the names of meshes of the catalogue that have some; or
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
             b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
-            task=pair_map with two closed meshes of genus 0: landmarks are proposed.
+            closed meshes of genus 0: landmarks are proposed, as they are where none are given;
+            []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the

@@ -17,8 +17,8 @@ from nsm.domains.orbifold.alignment import alignments_to_first
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -65,6 +65,7 @@ class CollectionMapTask(Task):
     closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
+    proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -84,7 +85,9 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console
+        )
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
@@ -211,6 +214,11 @@ class CollectionMapTask(Task):
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
         uv = evaluate(module.map[-1], start.numpy())
         return map_image(self.surface, self.phis[-1].surface, uv)
+
+    def save(self, folder: Path, result: SurfaceCollection) -> None:
+        super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)

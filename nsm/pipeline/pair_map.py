@@ -16,15 +16,8 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.proposed_landmarks import (
-    AUTO,
-    ProposedLandmarks,
-    asks_for_proposal,
-    propose_landmarks,
-)
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -95,17 +88,9 @@ class PairMapTask(Task):
         ]
         self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        self.proposed = None
-        if asks_for_proposal(landmarks, shapes, self.domain):
-            self.proposed = propose_landmarks(
-                shapes,
-                **settings["proposal"],
-                asked=landmarks == AUTO,
-                console=self.console,
-                repairs=configured_repairs(self.config),
-            )
-            landmarks = self.proposed.landmarks if self.proposed else None
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console
+        )
         counts = [vertex_count(shape) for shape in shapes]
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
