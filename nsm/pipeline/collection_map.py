@@ -13,7 +13,7 @@ from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
 from nsm.domains.joint_preparation import Matched, matched_landmarks
-from nsm.domains.orbifold.alignment import alignments_to_first
+from nsm.domains.orbifold.collection_alignment import alignments_to_first, disagreements
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
@@ -97,11 +97,17 @@ class CollectionMapTask(Task):
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)
-        self.targets, self.starts = targets, self._starts(targets)
+        self.starts = self._starts(targets)
         back = torch.stack([h.back(q) for h, q in zip(self.starts, targets, strict=True)])
         if not self.domain.has_boundary:
-            back = torch.stack([self.domain.lift(x, targets[0]) for x in back])
+            back = torch.stack(
+                [self.domain.lift(x, targets[0], self.surface.lattice) for x in back]
+            )
         self.points = back.mean(dim=0)
+        near = zip(self.phis, self.starts, targets, strict=True)
+        self.targets = torch.stack(
+            [self.domain.lift(q, h.before(self.points), phi.surface.lattice) for phi, h, q in near]
+        )
         on_boundary = slice(self.matched.on_boundary)
         if self.domain.has_boundary:
             self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
@@ -111,7 +117,16 @@ class CollectionMapTask(Task):
         surfaces = [phi.surface for phi in self.phis]
         if not self.domain.has_boundary:
             common = self.ids if targets.shape[1] else None
-            return [aligned(found.inverse) for found in alignments_to_first(surfaces, common)]
+            to_first = alignments_to_first(surfaces, common)
+            for pair in disagreements(surfaces, to_first, common):
+                ends = f"{surfaces[pair.source].name} → {surfaces[pair.target].name}"
+                self.console.print(
+                    f"{ends}: the isotopy class that follows from the other pairs scores "
+                    f"{pair.composed.score:.3f}, the pair's own best {pair.own.score:.3f}; if the "
+                    "map is distorted, map the pair alone or check its landmarks",
+                    soft_wrap=True,
+                )
+            return [aligned(found.inverse) for found in to_first]
         uv = torch.as_tensor(self.surface.uv, dtype=torch.float32)
         some = uv[:: len(uv) // 4096 + 1]
         first, *others = self.phis

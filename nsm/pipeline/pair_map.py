@@ -121,6 +121,7 @@ class PairMapTask(Task):
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
         self.start = start = self._start(p, q)
+        q = self.domain.lift(q, start.before(p), target.lattice)
         phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
