@@ -203,7 +203,9 @@ def section(results: dict[str, Any]) -> list[str]:
     totals = (f"**{of['cpu_seconds']:.1f}**" for of in cases.values())
     lines.append("| **total** | " + " | ".join(totals) + " |")
     before = (of["cpu_seconds"] - of["stages"].get(AFTER, 0.0) for of in cases.values())
-    lines.append("| until the figures are printed | " + " | ".join(f"{s:.1f}" for s in before) + " |")
+    lines.append(
+        "| until the figures are printed | " + " | ".join(f"{s:.1f}" for s in before) + " |"
+    )
     return lines
 
 
