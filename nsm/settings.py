@@ -223,13 +223,19 @@ class PhiSettings:
     """The neural surface that a map starts from.
 
     Args:
-        path: for task=param, the run folder of a neural surface; null: one is trained.
+        path: for task=param, the run folder of a neural surface; null: one is made.
         overrides: for maps, settings of the trainings of their neural surfaces, as in
             'phi.overrides=["map=residual","seed=1"]'.
+        steps: for maps, steps of these trainings at most, where they start from a least-squares
+            fit, which is near enough for a map; null: as many as task=overfit makes.
+        processes: for maps of several meshes, how many are prepared at once, each by a process on a
+            CPU core of its own; null: as many as there are cores.
     """
 
     path: str | None = None
     overrides: list[str] = field(default_factory=list)
+    steps: Whole | None = 0
+    processes: Count | None = None
 
 
 @dataclass
@@ -298,7 +304,7 @@ class TrainerSettings:
     """Length, hardware and stopping rule of the training, and what it records.
 
     Args:
-        max_steps: steps of the optimizer.
+        max_steps: steps of the optimizer; 0: the network stays as it starts.
         accelerator: auto, cpu or gpu.
         devices: processes that share each step, each with its part of the batch on its own CPU
             core or GPU.
@@ -321,7 +327,7 @@ class TrainerSettings:
         log_pictures: pictures of the surface or map in the logs.
     """
 
-    max_steps: Count = 8000
+    max_steps: Whole = 8000
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: Count = 1
     stop_gradient_norm: Weight | None = None

@@ -314,6 +314,7 @@ def neural_surfaces(
                 seam_landmarks=config.seam.landmarks,
                 cache=config.surface.cache,
                 repairs=configured_repairs(config),
+                processes=config.phi.get("processes"),
             )
         if not ready:
             _check_landmarks(prepared, landmarks)

@@ -173,11 +173,11 @@ def trained(
     module.log_every = settings.log_every
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))
-    several = settings.devices > 1
+    several = settings.devices > 1 and settings.max_steps > 0
     trainer = lightning_trainer(
         config,
         callbacks,
-        devices=settings.devices,
+        devices=settings.devices if several else 1,
         max_steps=settings.max_steps,
         strategy=shared_steps() if several else "auto",
         log_every_n_steps=settings.log_every,
