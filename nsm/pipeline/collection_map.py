@@ -35,6 +35,7 @@ from nsm.results import (
     transfer_matrix_picture,
     warning_of_tears,
 )
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
@@ -117,6 +118,7 @@ class CollectionMapTask(Task):
         return f"{self.name} of {len(self.phis)} surfaces"
 
     def build(self) -> Any:
+        names = [phi.surface.name for phi in self.phis]
         return self.module(
             **self.map_settings(),
             points=self.points,
@@ -126,6 +128,7 @@ class CollectionMapTask(Task):
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[phi.map for phi in self.phis],
+            names=names if len(set(names)) == len(names) else None,
         )
 
     def _mesh(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -182,10 +185,17 @@ class CollectionMapTask(Task):
         return {"surfaces": names, "landmarks": len(self.ids[0])}
 
     def picture(self, module: Any) -> np.ndarray:
-        # where the vertices of the first go if h_0 is taken for its start
+        return map_image(self.surface, self.phis[-1].surface, self._in_the_last(module))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.phis[-1].surface.at(self._in_the_last(module))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
+    def _in_the_last(self, module: Any) -> np.ndarray:
+        """Where the vertices of the first surface go in the last one's domain (V, 2), if h_0 is
+        taken for its start."""
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
-        uv = evaluate(module.map[-1], start.numpy())
-        return map_image(self.surface, self.phis[-1].surface, uv)
+        return evaluate(module.map[-1], start.numpy())
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)

@@ -26,6 +26,8 @@ from nsm.results import (
     overfit_metrics,
     reconstruction_image,
 )
+from nsm.results.meshes import ColouredMesh, painted
+from nsm.results.metrics import evaluate
 from nsm.results.textures import checkerboard_at
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
@@ -79,6 +81,10 @@ class OverfitTask(Task):
 
     def picture(self, module: Any) -> np.ndarray:
         return reconstruction_image(self.surface, module, size=384)
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        surface = self.surface
+        return painted(evaluate(module, surface.uv), surface.faces, surface.vertices)
 
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
         vertices, faces, uv = result.to_mesh()

@@ -48,6 +48,7 @@ from nsm.results import (
     transfer_picture,
     warning_of_tears,
 )
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
@@ -233,6 +234,10 @@ class PairMapTask(Task):
 
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.psi.surface.at(evaluate(module, self.surface.uv))
+        return painted(image, self.surface.faces, self.surface.vertices)
 
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)

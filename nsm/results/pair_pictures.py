@@ -15,6 +15,7 @@ from nsm.domains import Surface
 from nsm.energies import symmetric_dirichlet
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
+from nsm.results.meshes import by_position
 from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
 from nsm.results.render import Blend, View
 from nsm.results.surface_map import SurfaceMap
@@ -31,8 +32,7 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     """
     s, t = f.source.surface, f.target.surface
     target = f.aligned(t.vertices)
-    low, extent = s.vertices.min(axis=0), np.ptp(s.vertices, axis=0)
-    colours = (s.vertices - low) / np.maximum(extent, 1e-12)
+    colours = by_position(s.vertices)
     carried = f._back.take(colours, s.faces)
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
 

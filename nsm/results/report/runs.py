@@ -12,11 +12,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from nsm.errors import NsmError
+from nsm.results.readable_settings import readable
 
 Figure = float | str | None
-
-# settings that do not affect a result
-_INCIDENTAL = ("resume", "logger", "artefacts", "trust", "trainer.progress")
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def _read(folder: Path, name: str) -> Run:
         config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         if not isinstance(config, dict):
             raise ValueError("it has no settings")
-        settings = dict(_flat(config))
+        settings = readable(config)
         task = settings.pop("task")
     except FileNotFoundError as error:
         raise _damaged("config.yaml is missing", folder) from error
@@ -120,21 +118,6 @@ def _read(folder: Path, name: str) -> Run:
 
 def _damaged(reason: str, folder: Path) -> NsmError:
     return NsmError(reason, kind="damaged_file", key=str(folder))
-
-
-def _flat(settings: Mapping[Any, Any], group: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings by "group.key"; the ``name`` or ``_target_`` of a group by "group"."""
-    for key, value in settings.items():
-        name = f"{group}.{key}" if group else str(key)
-        if name in _INCIDENTAL or (key == "_target_" and "name" in settings):
-            continue
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, name)
-        elif group and key == "_target_":
-            ours = str(value).startswith(("nsm.", "torch."))
-            yield group, str(value).rsplit(".", 1)[-1] if ours else value
-        else:
-            yield (group if group and key == "name" else name), value
 
 
 def _figures(content: Any) -> dict[str, Figure]:

@@ -15,6 +15,7 @@ from matplotlib.colors import hsv_to_rgb
 from nsm.correspondence.landmark_list import LandmarkList
 from nsm.correspondence.preview import previewed
 from nsm.errors import NsmError
+from nsm.results.meshes import by_position
 from nsm.results.view.picking import hit
 
 _GAP = 1.3  # between the middles of shapes, in diameters
@@ -136,7 +137,7 @@ class LandmarkEditor:
         """Colour the first shape by position, the others as their coarse maps carry it there."""
         names, lists = self.landmarks.complete()
         source = self.shapes[0]
-        colours = [_by_position(self.placed[0])]
+        colours = [255 * by_position(self.placed[0])]
         lines = []
         try:
             for shape, ids in zip(self.shapes[1:], lists[1:], strict=True):
@@ -261,12 +262,6 @@ class LandmarkEditor:
                 act()
 
         return call
-
-
-def _by_position(vertices: np.ndarray) -> np.ndarray:
-    """Colours (V, 3) in [0, 255] by place in the bounding box."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return np.asarray(255 * (vertices - low) / np.maximum(high - low, 1e-12))
 
 
 def _carried(colours: np.ndarray, candidate: Any, vertices: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from matplotlib.colors import LogNorm, Normalize
 
 from nsm.domains import Surface
 from nsm.results.artifact import NeuralSurface
+from nsm.results.meshes import by_position
 from nsm.results.metrics import vertex_error
 from nsm.results.pair_metrics import triangle_energies
 from nsm.results.parameterization import Parameterization
@@ -178,8 +179,7 @@ class Scene:
             return Paint(scale.colours(values), None), Paint(scale.colours(on_target), None)
         colours = np.tile(GREY, (len(vertices), 1))
         if name == POSITION:
-            extent = np.maximum(np.ptp(vertices, axis=0), 1e-12)
-            colours = (vertices - vertices.min(axis=0)) / extent
+            colours = by_position(vertices)
         return Paint(colours, None), Paint(self.transferred(colours), None)
 
     def scale(self, name: str) -> Scale | None:
