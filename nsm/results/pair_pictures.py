@@ -23,6 +23,7 @@ from nsm.results.surface_map import SurfaceMap
 _STRIP, _GIF = 300, 300
 _TICKS = [4, 5, 7, 10, 20]
 _WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
+_SCALE = ScalarMappable(LogNorm(4, _WORST), "viridis")
 
 
 def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
@@ -58,24 +59,19 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
 def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     """Symmetric Dirichlet on the source and on its image, with its histogram."""
     s = f.source.surface
-    value = symmetric_dirichlet(
-        triangle_metric(s.vertices, s.faces), triangle_metric(f.image, s.faces)
-    ).numpy()
-    at_vertex = vertex_means(np.minimum(value, 1e3), s.faces, len(s.vertices))
-    scale = ScalarMappable(LogNorm(4, _WORST), "viridis")
-    colours = scale.to_rgba(at_vertex)[:, :3]
-
-    def paint(blend: Blend) -> np.ndarray:
-        return blend(colours)
-
+    value = _energy(s, f.image)
+    scale, colours = _SCALE, _coloured(s, value)
     view = View(s.vertices, PANEL)
     image = f.aligned_image
     other = View(image, PANEL, frame=view.frame)
     figure = panels(
         [
-            (view.draw(s.vertices, s.faces, paint, s.seam_pairs), f"{s.name}: symmetric Dirichlet"),
             (
-                other.draw(image, s.faces, paint, s.seam_pairs),
+                view.draw(s.vertices, s.faces, lambda blend: blend(colours), s.seam_pairs),
+                f"{s.name}: symmetric Dirichlet",
+            ),
+            (
+                other.draw(image, s.faces, lambda blend: blend(colours), s.seam_pairs),
                 f"its image on {f.target.surface.name}",
             ),
             (np.ones((PANEL, PANEL, 3)), ""),
@@ -94,6 +90,25 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     bar.set_ticks(_TICKS, labels=map(str, _TICKS))
     bar.ax.set_yticks([], minor=True)
     save_figure(figure, path)
+
+
+def distorted(view: View, surface: Surface, image: np.ndarray) -> np.ndarray:
+    """A surface coloured by the symmetric Dirichlet energy of its map to ``image`` (V, 3)."""
+    colours = _coloured(surface, _energy(surface, image))
+    vertices, faces = surface.vertices, surface.faces
+    return view.draw(vertices, faces, lambda blend: blend(colours), surface.seam_pairs)
+
+
+def _energy(surface: Surface, image: np.ndarray) -> np.ndarray:
+    """Symmetric Dirichlet (F,) of the map of a surface's triangles to ``image`` (V, 3)."""
+    before, after = (triangle_metric(v, surface.faces) for v in (surface.vertices, image))
+    return np.asarray(symmetric_dirichlet(before, after).numpy())
+
+
+def _coloured(surface: Surface, value: np.ndarray) -> np.ndarray:
+    """Colours (V, 3) of values (F,) of its triangles."""
+    at_vertex = vertex_means(np.minimum(value, 1e3), surface.faces, len(surface.vertices))
+    return np.asarray(_SCALE.to_rgba(at_vertex)[:, :3])
 
 
 def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> None:

@@ -16,6 +16,8 @@ from nsm.results.readable_settings import readable
 
 Figure = float | str | None
 
+_NAMED = 4  # surfaces of a collection in its name
+
 
 @dataclass(frozen=True)
 class Run:
@@ -25,6 +27,7 @@ class Run:
         folder: of the run.
         name: its path below the folder that was searched.
         task: overfit, param, ...
+        subject: what it is of: a surface, "source → target", or the surfaces of a collection.
         settings: values by "group.key"; the class or name that a group chooses by "group".
         figures: numbers, yes or no by name; None for a number that is not finite.
     """
@@ -32,6 +35,7 @@ class Run:
     folder: Path
     name: str
     task: str
+    subject: str
     settings: dict[str, Any]
     figures: dict[str, Figure]
 
@@ -100,7 +104,8 @@ def _unfinished(folder: Path) -> str:
 
 def _read(folder: Path, name: str) -> Run:
     try:
-        figures = _figures(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+        stored = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        figures = _figures(stored)
     except (OSError, ValueError, RecursionError, TypeError) as error:
         raise _damaged(f"metrics.json is damaged: {short(error)}", folder) from error
     try:
@@ -113,7 +118,17 @@ def _read(folder: Path, name: str) -> Run:
         raise _damaged("config.yaml is missing", folder) from error
     except Exception as error:  # a damaged or foreign file raises any exception
         raise _damaged(f"config.yaml is damaged: {short(error)}", folder) from error
-    return Run(folder, name, str(task), settings, figures)
+    return Run(folder, name, str(task), _subject(stored), settings, figures)
+
+
+def _subject(stored: Mapping[str, Any]) -> str:
+    surfaces = stored.get("surfaces")
+    if isinstance(surfaces, list) and surfaces:
+        few = [str(name) for name in surfaces[:_NAMED]]
+        more = [f"{len(surfaces) - _NAMED} more"] if len(surfaces) > _NAMED else []
+        return ", ".join([*few, *more])
+    ends = [str(stored[key]) for key in ("surface", "target") if isinstance(stored.get(key), str)]
+    return " → ".join(ends)
 
 
 def _damaged(reason: str, folder: Path) -> NsmError:

@@ -18,18 +18,12 @@ from nsm.results.metrics import vertex_error
 from nsm.results.pair_metrics import triangle_energies
 from nsm.results.parameterization import Parameterization
 from nsm.results.pictures import GREY, vertex_means
-from nsm.results.render import vertex_normals, view_frame
+from nsm.results.render import frames_of, vertex_normals
 from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import edges_of
 
 POSITION, PLAIN = "position on the source", "plain"
-# rotations of each axis to y, the upward axis of a view
-UP_AXES = {
-    sign + axis: flip @ np.roll(np.eye(3), -k, axis=0)
-    for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
-    for k, axis in enumerate("yzx")
-}
 _GAP = 0.2  # between the shapes, in widths of the wider one
 _FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; others use percentiles
 _LARGEST = 1e3
@@ -231,12 +225,12 @@ def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y
 
     Args:
         result: of a run.
-        up: the axis of the (source's) mesh file that points up, one of :data:`UP_AXES`.
+        up: the axis of the (source's) mesh file that points up, of
+            :data:`nsm.results.render.UP_AXES`.
     """
     mesh = result.source if isinstance(result, SurfaceMap) else result
     mesh = mesh.phi if isinstance(mesh, Parameterization) else mesh
-    turn = UP_AXES[up]
-    frame = view_frame(mesh.surface.vertices @ turn.T) @ turn
+    frame = frames_of(mesh.surface.vertices)[up]
     if isinstance(result, SurfaceMap):
         return _pair(result, frame)
     if isinstance(result, Parameterization):

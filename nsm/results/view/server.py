@@ -20,10 +20,11 @@ from nsm.optional_dependencies import needed
 from nsm.results.artifact import NeuralSurface
 from nsm.results.collection import SurfaceCollection
 from nsm.results.parameterization import Parameterization
+from nsm.results.render import UP_AXES
 from nsm.results.surface_map import SurfaceMap
 from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import Pick, pick
-from nsm.results.view.scene import UP_AXES, scene_of
+from nsm.results.view.scene import scene_of
 
 Result = NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection
 
