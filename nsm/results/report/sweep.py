@@ -1,4 +1,4 @@
-"""The figure at the end of a sweep, and its table: a row for each job, as in the paper's ablation."""
+"""The figure and the table at the end of a sweep: a row a job, as in the paper's ablation."""
 
 from __future__ import annotations
 

@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from matplotlib.colors import hsv_to_rgb
 
 from nsm.correspondence.landmark_list import LandmarkList
 from nsm.correspondence.preview import previewed
 from nsm.errors import NsmError
 from nsm.results.meshes import by_position
+from nsm.results.view.colours import distinct_colours
 from nsm.results.view.picking import hit
 
 _GAP = 1.3  # between the middles of shapes, in diameters
 _RADIUS = 0.02  # of a marker; every shape has the diameter one
-_GOLDEN = 0.618034  # each landmark's hue is that far from the one before
 _GREY, _UNPLACED = (190, 190, 190), "–"
 
 
@@ -198,13 +197,13 @@ class LandmarkEditor:
         self.name.value = "" if self.selected is None else self._names[self.selected]
 
     def _show_point(self, number: int, side: int, vertex: int) -> None:
-        colour = hsv_to_rgb([number * _GOLDEN % 1, 1.0, 0.9])
+        colour = distinct_colours(len(self.landmarks.landmarks))[number]
         position = self.placed[side][vertex]
         name = f"/shape{side}/landmark{number}"
         self.markers[number, side] = self.server.scene.add_icosphere(
             name,
             radius=_RADIUS * (1.6 if number == self.selected else 1.0),
-            color=tuple(np.round(255 * colour).astype(int).tolist()),
+            color=tuple(colour.tolist()),
             position=position,
         )
         self.server.scene.add_label(

@@ -46,6 +46,7 @@ class Shape:
         seam_pairs: (T, 2) copies of the same vertex of the uncut mesh.
         landmarks: (L,) vertices.
         closed: the mesh was not cut; copies of a vertex are lifts of it.
+        numbers: (V,) the vertices' numbers in the mesh file, -1 for points that were inserted.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Shape:
     seam_pairs: np.ndarray
     landmarks: np.ndarray = field(default_factory=lambda: _NO_VERTICES)
     closed: bool = False
+    numbers: np.ndarray = field(default_factory=lambda: _NO_VERTICES)
 
     @cached_property
     def _uncut(self) -> np.ndarray:
@@ -258,7 +260,8 @@ def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
     # facing the viewer, whatever the frame
     flat = (uv - middle) @ frame[:2]
     source = _file_shape(s.name, result.phi, s.vertices - _centre(s.vertices, frame), s.vertices)
-    target = Shape(f"{s.name}: flattened", flat, s.faces, s.uv, uv, s.seam_pairs)
+    name, numbers = f"{s.name}: flattened", s.source_vertex
+    target = Shape(name, flat, s.faces, s.uv, uv, s.seam_pairs, numbers=numbers)
     checkerboards = {
         "checkerboard of the plane": 2 * (uv - middle) / np.ptp(uv, axis=0).max(),
         "checkerboard of the domain": s.uv,
@@ -291,7 +294,9 @@ def _file_shape(
     s = neural.surface
     coordinates = neural.in_original_units(vertices)
     closed, marked = not s.domain.has_boundary, s.cut_vertex[landmarks]
-    return Shape(name, shown, s.faces, s.uv, coordinates, s.seam_pairs, marked, closed)
+    return Shape(
+        name, shown, s.faces, s.uv, coordinates, s.seam_pairs, marked, closed, s.source_vertex
+    )
 
 
 def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:
