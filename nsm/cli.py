@@ -22,7 +22,7 @@ from rich.console import Console
 
 from nsm.arguments import Arguments
 from nsm.command_line import prepared_overrides, with_task
-from nsm.config import conf_folder, register, setting_error
+from nsm.config import conf_folder, read_config, register, setting_error
 from nsm.errors import NsmError, of_disk
 from nsm.plugins import import_here, import_plugins
 from nsm.run_directories import remove_empty
@@ -212,12 +212,27 @@ def _check_alone(resume: str, overrides: Sequence[str]) -> None:
 
 
 def _sum_up() -> int:
-    """Print how a sweep went; exit status 1 if jobs of it failed."""
+    """Compare the jobs of a sweep, and print how it went; exit status 1 if jobs of it failed."""
     failed = [outcome for outcome in OUTCOMES if outcome.error is not None]
+    complete = [outcome.folder for outcome in OUTCOMES if outcome.error is None]
+    if len(complete) > 1:
+        _compare(complete)
     print(summary(OUTCOMES))
     for outcome in failed:
         _say(f"failed: {' '.join(outcome.overrides) or outcome.folder}: {outcome.error}")
     return 1 if failed else 0
+
+
+def _compare(folders: Sequence[Path]) -> None:
+    """Leave the figure and the table of a sweep's jobs in its folder, and print the table."""
+    console = Console(highlight=False, markup=False)
+    with stage(console, "figure of the sweep"):
+        from nsm.results.report.sweep import write_sweep
+
+        artefacts = read_config(folders[0] / "config.yaml").get("artefacts", True)
+        table = write_sweep(folders[0].parent, figure=bool(artefacts))
+    if table is not None:
+        console.print(table)
 
 
 def _answer(error: Exception) -> int:

@@ -38,6 +38,7 @@ from nsm.results import (
 )
 from nsm.results.collection_pictures import cycle_picture
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.tasks import CollectionMap
@@ -151,6 +152,7 @@ class CollectionMapTask(Task):
             points = torch.cat([points, corners])
             kept = torch.stack([start.before(corners) for start in self.starts])
             targets = torch.cat([targets, kept], dim=1)
+        names = [phi.surface.name for phi in self.phis]
         return self.module(
             **self.map_settings(),
             points=points,
@@ -160,6 +162,7 @@ class CollectionMapTask(Task):
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[phi.map for phi in self.phis],
+            names=names if len(set(names)) == len(names) else None,
         )
 
     def _mesh(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -225,10 +228,17 @@ class CollectionMapTask(Task):
         return {"surfaces": names, "landmarks": len(self.ids[0])}
 
     def picture(self, module: Any) -> np.ndarray:
-        # where the vertices of the first go if h_0 is taken for its start
+        return map_image(self.surface, self.phis[-1].surface, self._in_the_last(module))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.phis[-1].surface.at(self._in_the_last(module))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
+    def _in_the_last(self, module: Any) -> np.ndarray:
+        """Where the vertices of the first surface go in the last one's domain (V, 2), if h_0 is
+        taken for its start."""
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
-        uv = evaluate(module.map[-1], start.numpy())
-        return map_image(self.surface, self.phis[-1].surface, uv)
+        return evaluate(module.map[-1], start.numpy())
 
     def save(self, folder: Path, result: SurfaceCollection) -> None:
         super().save(folder, result)

@@ -45,6 +45,7 @@ from nsm.results import (
 )
 from nsm.results.file_faces import faces_of_file
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.results.pair_pictures import normals_picture
@@ -235,6 +236,10 @@ class PairMapTask(Task):
 
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.psi.surface.at(evaluate(module, self.surface.uv))
+        return painted(image, self.surface.faces, self.surface.vertices)
 
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)

@@ -137,8 +137,16 @@ def built(task: Task) -> Any:
 
 
 def pictures_of(task: Task) -> Pictures:
-    """The task's pictures over the training."""
-    return Pictures(task.picture_name, task.picture, task.config.trainer.log_pictures)
+    """The task's pictures, meshes and histograms over the training."""
+    settings = task.config.trainer
+    return Pictures(
+        task.picture_name,
+        task.picture,
+        settings.log_pictures,
+        task.mesh,
+        settings.log_meshes,
+        settings.log_histograms,
+    )
 
 
 def finish(

@@ -61,6 +61,8 @@ _HARDWARE = (
     "compile",
     "log_every",
     "log_pictures",
+    "log_meshes",
+    "log_histograms",
 )
 
 
