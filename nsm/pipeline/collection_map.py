@@ -86,7 +86,7 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids, self.proposed = given_or_proposed(
+        shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console
         )
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)

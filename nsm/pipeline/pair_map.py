@@ -89,10 +89,11 @@ class PairMapTask(Task):
         ]
         self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids, self.proposed = given_or_proposed(
-            landmarks, shapes, self.domain, self.config, self.console
-        )
+        of_files = self.textures is not None or any(settings["attributes"].values())
         counts = [vertex_count(shape) for shape in shapes]
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
+        )
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from nsm.domains import DOMAINS, Domain
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.configured_surface import configured_repairs
+from nsm.pipeline.landmark_places import as_places, with_places
 from nsm.pipeline.resolve_inputs import Shape, landmark_vertices
 from nsm.surfaces.landmark_files import to_json
 from nsm.surfaces.validation import CleanMesh, clean
@@ -35,6 +36,8 @@ class ProposedLandmarks:
         sure: whether that is enough.
         given: how many landmarks were given.
         chosen: the number of the hypothesis that is taken.
+        places: of each mesh the faces (F, 3) of its file and the places (G, 4) of given landmarks,
+            if they are places.
     """
 
     vertices: list[np.ndarray]
@@ -43,6 +46,7 @@ class ProposedLandmarks:
     sure: bool
     given: int
     chosen: int
+    places: Sequence[tuple[np.ndarray, np.ndarray] | None] = ()
 
     @property
     def landmarks(self) -> list[np.ndarray]:
@@ -52,18 +56,26 @@ class ProposedLandmarks:
     def to_json(self) -> str:
         """The landmarks as a file that can be corrected and given back, with the alternatives."""
         others = [
-            {**_lists(rows), "score": round(score, 4)}
+            {**_named(self._written(rows)), "score": round(score, 4)}
             for k, (rows, score) in enumerate(zip(self.vertices, self.scores, strict=True))
             if k != self.chosen
         ]
         return to_json(
-            self.landmarks,
+            self._written(self.vertices[self.chosen]),
             None,
             given=self.given,
             score=round(self.scores[self.chosen], 4),
             sure=self.sure,
             alternatives=others,
         )
+
+    def _written(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Landmarks (L, k) as the mesh files have them: without the vertices made for places."""
+        places = self.places or [None] * rows.shape[1]
+        return [
+            one if known is None else as_places(one, *known)
+            for one, known in zip(rows.T, places, strict=True)
+        ]
 
     @property
     def said(self) -> str:
@@ -85,7 +97,8 @@ def given_or_proposed(
     domain: Domain,
     config: DictConfig,
     console: Console,
-) -> tuple[list[np.ndarray], ProposedLandmarks | None]:
+    exact: bool = True,
+) -> tuple[list[Shape], list[np.ndarray], ProposedLandmarks | None]:
     """The landmarks of a map: those given, those proposed, or both.
 
     Landmarks are proposed if they are ``auto``; and on the orbifold for meshes if none are given,
@@ -98,9 +111,12 @@ def given_or_proposed(
         domain: of the map.
         config: of the run: its ``proposal`` and the decisions on meshes.
         console: where to say it.
+        exact: landmarks that are places in triangles become vertices; else the nearest vertex
+            stands for each.
 
     Returns:
-        vertices (L,) of each shape's mesh file, and the proposal if there is one.
+        the shapes, with these vertices; the landmarks as vertices (L,) of each; and the proposal if
+        there is one.
 
     Raises:
         NsmError: ``wrong_type``: ``auto`` for a shape that is no mesh; ``unsure_landmarks``, with
@@ -118,26 +134,37 @@ def given_or_proposed(
             kind="wrong_type",
             key="landmarks",
         )
-    ids = landmark_vertices(None if asked else landmarks, shapes, console)
+    if asked:
+        landmarks = None
     none = landmarks is None
+    known: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(shapes)
+    if exact and not none:
+        files = shapes
+        shapes, landmarks, places = with_places(landmarks, files, console)
+        known = [
+            (file.faces, one) if isinstance(file, Mesh) and one is not None else None
+            for file, one in zip(files, places, strict=True)
+        ]
+    meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
+    ids = landmark_vertices(landmarks, shapes, console)
     few = settings.complete and 1 <= len(ids[0]) <= _COMPLETED
     possible = len(meshes) == len(shapes) and domain == DOMAINS["orbifold"]
     if not (asked or (possible and (none or few))):
-        return ids, None
+        return list(shapes), ids, None
     repairs = configured_repairs(config)
     cleaned = [clean(mesh.vertices, mesh.faces, mesh.name, repairs) for mesh in meshes]
     if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):
-        return ids, None  # refused where the meshes are prepared
+        return list(shapes), ids, None  # refused where the meshes are prepared
     try:
         found = _proposal(cleaned, ids, settings.alternative)
     except NsmError as error:
         if asked or settings.strict or error.key == "proposal.alternative":
             raise
         console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
-        return ids, None
+        return list(shapes), ids, None
     if len(ids[0]) == _COMPLETED and not found.sure and not settings.alternative:
         console.print(f"{found.said}; only those given are taken", soft_wrap=True)
-        return ids, None
+        return list(shapes), ids, None
     if settings.strict and not found.sure:
         raise NsmError(
             f"{found.said}; give landmarks, or leave proposal.strict out",
@@ -149,7 +176,7 @@ def given_or_proposed(
     else:
         advice = "check landmarks.json of the run, or try proposal.alternative=1"
         console.print(Text(f"WARNING: {found.said}; {advice}", style="yellow"), soft_wrap=True)
-    return found.landmarks, found
+    return list(shapes), found.landmarks, replace(found, places=known)
 
 
 def _proposal(
@@ -186,7 +213,8 @@ def _proposal(
     return ProposedLandmarks(numbers, scores, margin, sure, len(ids[0]), alternative)
 
 
-def _lists(rows: np.ndarray) -> dict[str, Any]:
-    if rows.shape[1] == 2:
-        return {"source": rows[:, 0].tolist(), "target": rows[:, 1].tolist()}
-    return {"landmarks": rows.T.tolist()}
+def _named(lists: Sequence[np.ndarray]) -> dict[str, Any]:
+    plain = [one.tolist() for one in lists]
+    if len(plain) == 2:
+        return {"source": plain[0], "target": plain[1]}
+    return {"landmarks": plain}

@@ -11,7 +11,7 @@ from tiny import results
 
 from nsm.config import compose_config
 from nsm.correspondence import CollectionProposal, Hypothesis, Proposal
-from nsm.domains import DOMAINS
+from nsm.domains import DOMAINS, Surface
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline import proposed_landmarks
@@ -50,7 +50,7 @@ def take(landmarks, *words, shapes=None, domain=ORBIFOLD):
     """The landmarks of two spheres, the proposal, and what is said."""
     console = Console(record=True, width=300)
     config = compose_config(["task=pair_map", *words])
-    ids, found = given_or_proposed(landmarks, shapes or meshes(), domain, config, console)
+    _, ids, found = given_or_proposed(landmarks, shapes or meshes(), domain, config, console)
     return [x.tolist() for x in ids], found, console.export_text()
 
 
@@ -123,6 +123,46 @@ def test_unsure_ones_complete_fewer_than_four_only(monkeypatch):
     assert len(ids[0]) == 7 and "WARNING" in said
     assert len(take(pairs, "proposal.alternative=1")[0][0]) == 8  # who asks for it has it
     assert len(take([*pairs, [300, 300]])[0][0]) == 5  # five are complete
+
+
+PLACES = [[[0, 0.2, 0.3, 0.5], [7, 0.5, 0.5, 0.0]], [[4, 0.1, 0.1, 0.8], [9, 0.0, 1.0, 0.0]]]
+
+
+@pytest.mark.parametrize("domain", [ORBIFOLD, DISC])
+def test_places_in_triangles_are_kept_as_they_are(domain):
+    given = {"source": PLACES[0], "target": PLACES[1]}
+    files = meshes()
+    console, config = Console(quiet=True), compose_config(["task=pair_map"])
+    config.proposal.complete = False
+    shapes, ids, _ = given_or_proposed(given, files, domain, config, console)
+    for file, shape, of_one, places in zip(files, shapes, ids, PLACES, strict=True):
+        wanted = [np.array(w) @ file.vertices[file.faces[int(f)]] for f, *w in places]
+        assert np.allclose(shape.vertices[of_one], wanted)
+        assert np.array_equal(shape.vertices[: len(file.vertices)], file.vertices)
+        surface = Surface.load((shape.vertices, shape.faces), domain=domain)
+        found = surface.at(surface.preimages(of_one.tolist()))
+        assert np.allclose(found / surface.scale + surface.center, wanted, atol=1e-6)
+    _, nearest, _ = given_or_proposed(given, files, domain, config, console, exact=False)
+    for file, of_one, places in zip(files, nearest, PLACES, strict=True):
+        corners = [file.faces[int(f)][np.argmax(w)] for f, *w in places]
+        assert of_one[0] == corners[0] and of_one[1] in file.faces[int(places[1][0])]
+    bad = {"source": [[0, 0.2, 0.3, 0.9]], "target": [[4, 0.1, 0.1, 0.8]]}
+    with pytest.raises(NsmError) as refused:
+        given_or_proposed(bad, files, domain, config, console)
+    assert (refused.value.kind, refused.value.key) == ("not_on_surface", "a")
+
+
+def test_places_are_written_as_places(monkeypatch, tmp_path):
+    answers(monkeypatch, 0.5)
+    ids, found, said = take({"source": PLACES[0], "target": [50, 60]})
+    count = len(meshes()[0].vertices)
+    assert ids[0][:2] == [count, count + 1] and "become vertices" in said
+    (tmp_path / "landmarks.json").write_text(found.to_json())
+    source, target = read_pairs(tmp_path / "landmarks.json")
+    assert target == ids[1] and source[:2].tolist() == PLACES[0]
+    faces = meshes()[0].faces
+    for (face, *weights), vertex in zip(source[2:], ids[0][2:], strict=True):
+        assert faces[int(face)][np.argmax(weights)] == vertex and max(weights) == 1
 
 
 def test_landmarks_of_a_collection(monkeypatch, tmp_path):
