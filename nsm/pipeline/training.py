@@ -221,7 +221,7 @@ def trained(
         if len(runs) > 1 or runs[0].inner:  # of a sweep, or for a map
             how = "; the same command goes on"
         console.print(f"interrupted{'' if is_temporary(folder) else how}", soft_wrap=True)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt("told")
     if several:
         take_over(trainer, folder / CHECKPOINT_FILE)
         trainer.loggers = loggers(trainer.global_step + 1)

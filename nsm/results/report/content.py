@@ -19,6 +19,7 @@ from nsm.results.report.sweep import FIGURE
 from nsm.results.tables import FIGURES
 
 _BINS = 60
+_TALLEST = 8000  # pixels of the figure of a sweep
 _HISTOGRAMS = ("symmetric dirichlet", "singular value ratio", "area")
 _BEST = {
     "covered_percent": "high",
@@ -79,7 +80,7 @@ def _sweeps(runs: Sequence[Run], remarks: list[dict[str, str]]) -> list[dict[str
     for folder in dict.fromkeys(run.folder.resolve().parent for run in runs):
         if (folder / FIGURE).is_file():
             try:
-                picture = read_picture(folder / FIGURE)
+                picture = read_picture(folder / FIGURE, _TALLEST)
                 pictures.append({"name": folder.name, "picture": picture})
             except UNREADABLE as error:
                 remarks.append({"name": folder.name, "reason": f"{FIGURE}: {short(error)}"})

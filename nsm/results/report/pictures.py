@@ -28,10 +28,10 @@ def read_pictures(folder: Path) -> tuple[dict[str, str], list[str]]:
     return pictures, remarks
 
 
-def read_picture(file: Path) -> str:
-    """The data URI of a picture, reduced in size."""
+def read_picture(file: Path, tallest: int = 2 * _WIDTH) -> str:
+    """The data URI of a picture, reduced to at most 1000 pixels in width and to a height."""
     with Image.open(file) as image:
-        image.thumbnail((_WIDTH, 2 * _WIDTH))
+        image.thumbnail((_WIDTH, tallest))
         data = io.BytesIO()
         image.convert("RGB").save(data, format="WEBP", quality=82)
     return f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode()}"
