@@ -16,15 +16,8 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.proposed_landmarks import (
-    AUTO,
-    ProposedLandmarks,
-    asks_for_proposal,
-    propose_landmarks,
-)
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -52,8 +45,10 @@ from nsm.results import (
 )
 from nsm.results.file_faces import faces_of_file
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
+from nsm.results.pair_pictures import normals_picture
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
     aligned,
@@ -94,18 +89,11 @@ class PairMapTask(Task):
         ]
         self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        self.proposed = None
-        if asks_for_proposal(landmarks, shapes, self.domain):
-            self.proposed = propose_landmarks(
-                shapes,
-                **settings["proposal"],
-                asked=landmarks == AUTO,
-                console=self.console,
-                repairs=configured_repairs(self.config),
-            )
-            landmarks = self.proposed.landmarks if self.proposed else None
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        of_files = self.textures is not None or any(settings["attributes"].values())
         counts = [vertex_count(shape) for shape in shapes]
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
+        )
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
@@ -135,6 +123,7 @@ class PairMapTask(Task):
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
         self.start = start = self._start(p, q)
+        q = self.domain.lift(q, start.before(p), target.lattice)
         phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
@@ -249,6 +238,10 @@ class PairMapTask(Task):
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
 
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.psi.surface.at(evaluate(module, self.surface.uv))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
         if self.proposed is not None:
@@ -274,6 +267,8 @@ class PairMapTask(Task):
         _write_morph(folder, f)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
+        if isinstance(f.target.map, AnalyticSurface):
+            normals_picture(folder / "normals.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
 
 
