@@ -145,9 +145,10 @@ def map_pair(
 
 
 def map_collection(
-    surfaces: Sequence[Any],
+    surfaces: Any,
     landmarks: Any = None,
     *,
+    template: Any = None,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: bool = True,
@@ -156,26 +157,31 @@ def map_collection(
     """Put three surfaces or more into correspondence, every one with every other.
 
     Args:
-        surfaces: as for :func:`map_pair`.
-        landmarks: for each surface a list of vertices or points, or a file; or one JSON file.
+        surfaces: as for :func:`map_pair`, in a list; or a pattern of files, ``"scans/*.ply"``.
+        landmarks: for each surface a list of vertices or points, None for one that it lacks, or a
+            file; or one JSON or CSV file; or a folder with a file for each surface. By default
+            files beside the meshes that have their names.
+        template: a surface that all others are mapped to and from; the first of the collection.
         overrides, folder, progress, **settings: as for :func:`overfit`.
 
     Returns:
-        The collection; ``collection.pair(i, j)`` is the map from one surface to another.
+        The collection; ``collection.pair(i, j)`` is the map from one surface to another, by number
+        or name.
 
     Raises:
         NsmError: a surface, landmark or setting that cannot be used.
 
     Examples:
         >>> animals = nsm.map_collection(["a.off", "b.off", "c.off"], ["a.vts", "b.vts", "c.vts"])
-        >>> animals.pair(0, 2).transfer(colours)
+        >>> animals.pair("a", "c").transfer(colours)
     """
-    if not isinstance(surfaces, Sequence) or isinstance(surfaces, str):
+    if not isinstance(surfaces, (Sequence, Path)):
         raise NsmError("surfaces: give a list of them", kind="wrong_type", key="surfaces")
-    ready = _prepared(surfaces)
+    listed = [surfaces] if isinstance(surfaces, (str, Path)) else surfaces
+    ready = _prepared([*listed, template])
     request = _Request("collection_map", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
-        given = Given(surfaces=surfaces, landmarks=landmarks)
+        given = Given(surfaces=listed, landmarks=landmarks, template=template)
         return run_task(config, place, given=given, quiet=not progress)
 
 
@@ -186,7 +192,9 @@ def _prepared(given: Sequence[Any]) -> list[Surface]:
 
 
 # what the function that is called, and its arguments, say
-_ARGUMENTS = ("task", "surface", "phi.path", "source", "target", "surfaces", "landmarks")
+_ARGUMENTS = (
+    *("task", "surface", "phi.path", "source", "target", "surfaces", "template", "landmarks"),
+)
 
 
 class _Request:

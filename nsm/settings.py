@@ -421,11 +421,16 @@ class Settings:
         source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface.
         target: the same; or an analytic surface: a name (sphere_cap, plane, ...; sphere with
             domain=orbifold, torus with domain=torus) or '{name: graph, z: 0.3*u*v}'.
-        surfaces: of task=collection_map: three surfaces or more, each as source.
+        surfaces: of task=collection_map: three surfaces or more, each as source; or a pattern of
+            files, 'surfaces=scans/*.ply'.
+        template: of task=collection_map: a surface as source, which every other is mapped to and
+            from; landmarks are numbered or named as on it.
         landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned, .bary, .pp or
             .json, one for each surface, or the names of meshes of the catalogue that have some; or
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
-            b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
+            b2] with barycentric coordinates, stands for the vertex nearest to it, and -1 or null
+            for a landmark that the surface lacks; a CSV file with a column for each surface; a
+            folder with a file for each surface, of its name; auto, for
             task=pair_map with two closed meshes of genus 0: landmarks are proposed.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
@@ -447,7 +452,8 @@ class Settings:
     phi: PhiSettings = field(default_factory=PhiSettings)
     source: str | dict[str, Any] | None = None
     target: str | dict[str, Any] | None = None
-    surfaces: list[Any] | None = None
+    surfaces: str | list[Any] | None = None
+    template: str | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
     texture: str | None = None
     texture_size: Annotated[int, Range(1, 8192)] = 1024

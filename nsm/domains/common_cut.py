@@ -48,6 +48,7 @@ def best_common_cut(
     landmarks: Sequence[np.ndarray],
     seam: str,
     seam_landmarks: int | None,
+    others: Sequence[np.ndarray],
 ) -> CommonCut:
     """Closed genus-0 meshes cut along corresponding seams.
 
@@ -56,6 +57,7 @@ def best_common_cut(
         cleaned: the meshes.
         landmarks: (L,) corresponding vertices of each.
         seam, seam_landmarks: as for :func:`nsm.domains.joint_preparation.prepare_jointly`.
+        others: further vertices of each that no seam may touch.
 
     Raises:
         NsmError: ``no_common_seam``.
@@ -75,12 +77,13 @@ def best_common_cut(
         tried = []
         for k, (path, count) in enumerate(ways):
             at("trying seams", k, len(ways))
-            way = _common_cut(names, cleaned, landmarks, path, costs[path], count)
+            way = _common_cut(names, cleaned, landmarks, path, costs[path], count, others)
             if way is not None:
                 tried.append((_disagreement(way, landmarks), k, way))
         best = min(tried, default=(0.0, 0, None))[2]
     else:
-        best = _common_cut(names, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
+        count = seam_landmarks or total
+        best = _common_cut(names, cleaned, landmarks, seam, costs[seam], count, others)
     if best is None:
         raise NsmError(
             "no seams through the landmarks were found: some are too close together for the "
@@ -98,13 +101,15 @@ def _common_cut(
     seam: str,
     costs: Sequence[np.ndarray],
     count: int,
+    others: Sequence[np.ndarray],
 ) -> CommonCut | None:
     """The meshes cut along one tree through ``count`` landmarks, whose branches are the cheapest
     by costs (E,) of each mesh's edges; None if there is no such tree."""
     pairs = [(c.vertices, c.faces) for c in cleaned]
     chosen = mutually_far(pairs, landmarks, count)
     on_seam = [ids[chosen] for ids in landmarks]
-    paths = corresponding_paths(pairs, on_seam, costs, avoid=landmarks)
+    avoid = [np.concatenate([ids, more]) for ids, more in zip(landmarks, others, strict=True)]
+    paths = corresponding_paths(pairs, on_seam, costs, avoid=avoid)
     if paths is None:
         return None
     cuts = [

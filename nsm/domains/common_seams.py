@@ -236,7 +236,7 @@ def edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def boundary_keys(origin: np.ndarray, loop: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
     """(K, 2) int64: the landmark's number, and the cut vertex, of each copy of a landmark on the
     boundary loop (B,), in the loop's order."""
-    number = {int(v): k for k, v in enumerate(landmarks)}
+    number = {int(v): k for k, v in enumerate(landmarks) if v >= 0}
     rows = [(number[o], int(v)) for v in loop if (o := int(origin[v])) in number]
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 

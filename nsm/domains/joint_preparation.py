@@ -20,6 +20,7 @@ from nsm.errors import NsmError
 from nsm.stages import counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
+from nsm.surfaces.landmarks import MISSING
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 
@@ -53,7 +54,7 @@ def prepare_jointly(
 
     Args:
         meshes: two or more.
-        landmarks: (L,) vertices of each, in the same order.
+        landmarks: (L,) vertices of each, in the same order; -1 for one that a mesh lacks.
         domain, parameterization, cache, repairs: as for :meth:`Surface.load`.
         seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
             ``auto``, which tries both and keeps the seam for which the domains agree best; or
@@ -68,7 +69,9 @@ def prepare_jointly(
     domain = domain_of(domain)
     cleaned = [clean(m.vertices, m.faces, m.name, repairs) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
-    enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
+    everywhere: np.ndarray = np.all(np.stack(found) >= 0, axis=0)
+    common_ids = [ids[everywhere] for ids in found]
+    enough = everywhere.sum() >= 2 if domain.has_boundary else len(distinct(common_ids)) >= 4
     apart = seam == "own" and domain.has_boundary
     kinds = [topology.genus_and_boundary(c.faces) for c in cleaned]
     common = check_common_topology([m.name for m in meshes], kinds)
@@ -109,10 +112,10 @@ def prepare_jointly(
             ]
     if domain.has_boundary:
         surfaces = _cut_and_embed(
-            meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
+            meshes, cleaned, found, everywhere, domain, parameterization, seam, seam_landmarks
         )
     else:
-        surfaces = _with_common_cones(meshes, cleaned, found, domain, parameterization)
+        surfaces = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
@@ -165,10 +168,10 @@ def check_common_topology(
 
 
 def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
-    """Landmarks as vertices of the cleaned mesh."""
-    kept = mesh.merged[landmarks]
+    """Landmarks as vertices of the cleaned mesh; -1 for those that it lacks."""
+    kept = np.where(landmarks >= 0, mesh.merged[landmarks], MISSING)
     for given, vertex in zip(landmarks, kept, strict=True):
-        if vertex < 0:
+        if vertex < 0 <= given:
             raise NsmError(
                 f"{name}: landmark {given} is not on the surface; give another vertex",
                 kind="not_on_surface",
@@ -181,16 +184,20 @@ def _cut_and_embed(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
+    everywhere: np.ndarray,
     domain: Domain,
     method: str,
     seam: str,
     seam_landmarks: int | None,
 ) -> list[Surface]:
+    """The meshes cut through landmarks that all have, mask (L,), and past all others."""
     names = [m.name for m in meshes]
-    best = best_common_cut(names, cleaned, landmarks, seam, seam_landmarks)
+    common = [ids[everywhere] for ids in landmarks]
+    others = [ids[~everywhere & (ids >= 0)] for ids in landmarks]
+    best = best_common_cut(names, cleaned, common, seam, seam_landmarks, others)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     line = (
-        f"seam led along {best.seam} paths through {best.count} of {len(landmarks[0])} landmarks, "
+        f"seam led along {best.seam} paths through {best.count} of {len(common[0])} landmarks, "
         "the same on all meshes"
     )
     return [
@@ -214,7 +221,8 @@ def _cut_and_embed(
 class Matched:
     """Landmarks found in the domains of several surfaces.
 
-    points: (K, 2) in Ω, one array per surface; numbers: (K,) which landmark each is. The first
+    points: (K, 2) in Ω, one array per surface, NaN for a landmark that the surface lacks; numbers:
+    (K,) which landmark each is. The first
     ``on_boundary`` lie on ∂Ω, in the order in which it is walked counter-clockwise; a landmark on
     the seam is there once for each time that the walk passes it.
     """
@@ -257,18 +265,28 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
 
     Args:
         surfaces: all of one domain.
-        landmarks: vertices (L,) of each one's mesh file.
+        landmarks: vertices (L,) of each one's mesh file; -1 for one that a surface lacks.
 
     Raises:
-        NsmError: a landmark that a surface does not have, or boundaries that do not correspond.
+        NsmError: a landmark that is not on its surface, or boundaries that do not correspond.
     """
     if not surfaces[0].domain.has_boundary:
-        points = [s.preimages(ids.tolist()) for s, ids in zip(surfaces, landmarks, strict=True)]
+        points = [_places(s, ids) for s, ids in zip(surfaces, landmarks, strict=True)]
         return Matched(points, np.arange(len(landmarks[0])), 0)
-    keys = [
-        boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], s.kept(ids.tolist()))
-        for s, ids in zip(surfaces, landmarks, strict=True)
-    ]
+    everywhere: np.ndarray = np.all(np.stack(landmarks) >= 0, axis=0)
+    keys = []
+    for s, ids in zip(surfaces, landmarks, strict=True):
+        kept = np.full(len(ids), MISSING)
+        kept[ids >= 0] = s.kept(ids[ids >= 0].tolist())
+        key = boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], kept)
+        for k in key[~everywhere[key[:, 0]], 0][:1].tolist():
+            raise NsmError(
+                f"landmark {k} is on the boundary of {s.name}, or on its cut, and other surfaces "
+                "lack it; leave it out, or move it off the boundary",
+                kind="no_common_seam",
+                key="landmarks",
+            )
+        keys.append(key)
     aligned = aligned_keys(keys)
     if aligned is None:
         names = " and ".join(s.name for s in surfaces)
@@ -280,7 +298,14 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
         )
     inner = np.setdiff1d(np.arange(len(landmarks[0])), keys[0][:, 0])
     points = [
-        np.concatenate([s.uv[key[:, 1]], s.preimages(ids[inner].tolist())])
+        np.concatenate([s.uv[key[:, 1]], _places(s, ids[inner])])
         for s, key, ids in zip(surfaces, aligned, landmarks, strict=True)
     ]
     return Matched(points, np.concatenate([aligned[0][:, 0], inner]), len(aligned[0]))
+
+
+def _places(surface: Surface, ids: np.ndarray) -> np.ndarray:
+    """Points (L, 2) of Ω of vertices (L,) of the mesh file; NaN for those that it lacks."""
+    points = np.full((len(ids), 2), np.nan)
+    points[ids >= 0] = surface.preimages(ids[ids >= 0].tolist())
+    return points

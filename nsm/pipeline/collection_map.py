@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,13 @@ import torch
 from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
-from nsm.domains.joint_preparation import Matched, matched_landmarks
+from nsm.domains.joint_preparation import Matched, Mesh, matched_landmarks
 from nsm.domains.orbifold.alignment import alignments_to_first
-from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
+from nsm.pipeline.collection_inputs import collected
+from nsm.pipeline.landmark_inputs import landmark_vertices, name_of
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -27,6 +29,7 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     SurfaceCollection,
+    SurfaceMap,
     collection_metrics,
     collection_table,
     export_surface,
@@ -35,7 +38,9 @@ from nsm.results import (
     transfer_matrix_picture,
     warning_of_tears,
 )
+from nsm.results.meshes import export_ply
 from nsm.results.metrics import evaluate
+from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
 
@@ -56,26 +61,36 @@ class CollectionMapTask(Task):
     closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
+    has_template = False  # the first surface is one
+    template_faces: np.ndarray | None = None  # (F, 3) of its file
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
-        return list(surfaces) if isinstance(surfaces, (list, tuple)) else []
+        return collected(surfaces, self._template(given))
+
+    def _template(self, given: Given) -> Any:
+        # absent in older run folders
+        return self.settings.get("template") if given.template is None else given.template
 
     def prepare(self, given: Given) -> None:
-        self.keep_absolute("surfaces", "landmarks")
-        surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
-        if not isinstance(surfaces, Sequence) or isinstance(surfaces, str) or len(surfaces) < 3:
-            raise NsmError(
-                "setting surfaces: a collection needs a list of three surfaces or more",
-                kind="out_of_range",
-                key="surfaces",
-            )
+        surfaces, template = self.inputs(given), self._template(given)
+        if given.surfaces is None:  # those that match a pattern now
+            self.config.surfaces = surfaces if template is None else surfaces[1:]
+        self.keep_absolute("surfaces", "template", "landmarks")
         shapes = [
             read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        if landmarks is None:
+            landmarks = files_beside(surfaces, [name_of(shape) for shape in shapes])
+            if landmarks is not None:
+                files = ", ".join(Path(file).name for file in landmarks)
+                self.console.print(f"landmarks beside the meshes: {files}", soft_wrap=True)
+        self.has_template = template is not None
+        first = shapes[0]
+        self.template_faces = first.faces if isinstance(first, Mesh) else None
+        ids = landmark_vertices(landmarks, shapes, self.console, template=self.has_template)
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
@@ -86,10 +101,13 @@ class CollectionMapTask(Task):
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)
         self.targets, self.starts = targets, self._starts(targets)
-        back = torch.stack([h.back(q) for h, q in zip(self.starts, targets, strict=True)])
+        there = torch.isfinite(targets).all(dim=-1)
+        some = torch.where(there[..., None], targets, 0.0)
+        back = torch.stack([h.back(q) for h, q in zip(self.starts, some, strict=True)])
         if not self.domain.has_boundary:
-            back = torch.stack([self.domain.lift(x, targets[0]) for x in back])
-        self.points = back.mean(dim=0)
+            first = back[there.int().argmax(dim=0), torch.arange(len(self.matched.numbers))]
+            back = torch.stack([self.domain.lift(x, first) for x in back])
+        self.points = (back * there[..., None]).sum(dim=0) / there.sum(dim=0)[:, None]
         on_boundary = slice(self.matched.on_boundary)
         if self.domain.has_boundary:
             self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
@@ -105,8 +123,9 @@ class CollectionMapTask(Task):
         first, *others = self.phis
         rotations = [torch.eye(2)]
         for k, phi in enumerate(others, start=1):
-            if targets.shape[1]:
-                rotations.append(landmark_rotation(self.domain, targets[0], targets[k]))
+            both = torch.isfinite(targets[[0, k]]).all(dim=-1).all(dim=0)
+            if both.any():
+                rotations.append(landmark_rotation(self.domain, targets[0, both], targets[k, both]))
             else:
                 rotation = least_distorting_rotation(self.domain, first.map, phi.map, some)
                 rotations.append(rotation)
@@ -178,8 +197,8 @@ class CollectionMapTask(Task):
         return [torn for torn in every if torn is not None]
 
     def figures(self, result: SurfaceCollection) -> dict[str, Any]:
-        names = [phi.surface.name for phi in self.phis]
-        return {"surfaces": names, "landmarks": len(self.ids[0])}
+        said = {"surfaces": result.names, "landmarks": len(self.ids[0])}
+        return {**said, "template": result.names[0]} if self.has_template else said
 
     def picture(self, module: Any) -> np.ndarray:
         # where the vertices of the first go if h_0 is taken for its start
@@ -190,14 +209,26 @@ class CollectionMapTask(Task):
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)
         transfer_matrix_picture(folder / "transfer.png", result)
-        for i, source in enumerate(result.surfaces):
-            for j, target in enumerate(result.surfaces):
-                if i != j:
-                    self._write_pair(folder / f"{i}_to_{j}", result.pair(i, j), source, target)
+        names = [re.sub(r"[/\\]", "_", name) for name in result.names]
+        for i, j in itertools.permutations(range(len(result)), 2):
+            if self.has_template and 0 not in (i, j):
+                continue
+            f = result.pair(i, j)
+            self._write_pair(folder / f"{names[i]}_to_{names[j]}", f)
+            if self.has_template and i == 0:
+                points = f.target.in_original_units(f.welded_image)
+                faces = self._kept_faces(f)
+                export_ply(folder / f"{names[j]}_in_{names[0]}.ply", points, faces)
 
-    def _write_pair(
-        self, folder: Path, f: Any, source: NeuralSurface, target: NeuralSurface
-    ) -> None:
+    def _kept_faces(self, f: SurfaceMap) -> np.ndarray:
+        """Faces (F, 3) of the template's file, in its order, but for those of removed parts."""
+        if self.template_faces is None:
+            return f.weld.faces
+        there = f.source.surface.cut_vertex >= 0
+        return np.asarray(self.template_faces[there[self.template_faces].all(axis=1)])
+
+    def _write_pair(self, folder: Path, f: SurfaceMap) -> None:
+        target = f.target
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.welded_image)
         np.save(folder / "mapped_vertices.npy", image)

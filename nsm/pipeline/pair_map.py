@@ -18,6 +18,7 @@ from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.configured_surface import configured_repairs
+from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.pipeline.proposed_landmarks import (
     AUTO,
     ProposedLandmarks,
@@ -25,7 +26,6 @@ from nsm.pipeline.proposed_landmarks import (
     propose_landmarks,
 )
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,15 +33,18 @@ class Given:
         phi: of task=param, a neural surface, or as ``surface``.
         source, target: of task=pair_map, as :func:`nsm.pipeline.resolve_inputs.read_shape` takes
             them.
-        surfaces: of task=collection_map, each the same.
-        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
+        surfaces: of task=collection_map, as :func:`nsm.pipeline.collection_inputs.collected` takes
+            them.
+        template: of task=collection_map, as ``source``.
+        landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them.
     """
 
     surface: Any = None
     phi: Any = None
     source: Any = None
     target: Any = None
-    surfaces: Sequence[Any] | None = None
+    surfaces: Any = None
+    template: Any = None
     landmarks: Any = None
 
 

@@ -65,6 +65,21 @@ def export_mesh(
     atomic_write(target, "".join(lines).encode())
 
 
+def export_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a mesh (V, 3), (F, 3) as a binary PLY file in double precision, in the given order."""
+    from plyfile import PlyData, PlyElement
+
+    points = np.empty(len(vertices), dtype=[(axis, "f8") for axis in "xyz"])
+    for axis, column in zip("xyz", np.asarray(vertices).T, strict=True):
+        points[axis] = column
+    triangles = np.empty(len(faces), dtype=[("vertex_indices", "i4", (3,))])
+    triangles["vertex_indices"] = faces
+    stream = io.BytesIO()
+    elements = [PlyElement.describe(points, "vertex"), PlyElement.describe(triangles, "face")]
+    PlyData(elements, byte_order="<").write(stream)
+    atomic_write(path, stream.getvalue())
+
+
 def export_surface(
     path: str | Path, vertices: np.ndarray, surface: Surface, uv: np.ndarray
 ) -> None:

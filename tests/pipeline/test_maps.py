@@ -14,7 +14,7 @@ from nsm.config import compose_config
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline import Given, run_task
-from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.results.metrics import evaluate
 from nsm.results.textured_mesh import TexturedMesh
 from nsm.surfaces.atlas import unwrapped

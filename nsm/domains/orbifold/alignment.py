@@ -136,14 +136,18 @@ def alignments_to_first(
 
     Args:
         surfaces: on the same closed domain.
-        landmarks: corresponding vertices (L,) of each mesh file, if any.
+        landmarks: corresponding vertices (L,) of each mesh file, if any; -1 for one that a mesh
+            lacks.
 
     Raises:
         NsmError: as :func:`alignments`.
     """
     first = [Alignment(np.eye(2, dtype=np.int64), np.zeros(2), float(np.log(_least())), 0.0)]
     for k, surface in enumerate(surfaces[1:], start=1):
-        common = None if landmarks is None else (landmarks[k], landmarks[0])
+        common = None
+        if landmarks is not None:
+            both = (landmarks[k] >= 0) & (landmarks[0] >= 0)
+            common = (landmarks[k][both], landmarks[0][both])
         first.append(alignments(surface, surfaces[0], common)[0])
     return first
 
