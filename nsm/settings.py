@@ -204,6 +204,8 @@ class SurfaceSettings:
             falling area, says which is kept; null: small ones are removed, others refused.
         repair: split cuts a mesh apart at non-manifold edges (three faces or more); null: it is
             refused.
+        fill_holes: fill holes of at most so many edges for the map; true: small ones, shorter than
+            half the square root of the area; exported meshes keep the holes.
         parameterization: of the mesh over Ω: slim (low distortion) or tutte.
         cache: keep the prepared surface on disk, under a hash of its content.
     """
@@ -214,6 +216,7 @@ class SurfaceSettings:
     cones: list[int] | None = None
     parts: Literal["largest"] | Whole | None = None
     repair: Literal["split"] | None = None
+    fill_holes: bool | Count = False
     parameterization: Literal["slim", "tutte"] = "slim"
     cache: bool = True
 

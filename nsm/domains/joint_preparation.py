@@ -159,8 +159,8 @@ def check_common_topology(
         if (genus, loops) != found[0]:
             raise NsmError(
                 f"{name} has genus {genus} and {loops} boundary loops, {names[0]} genus "
-                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes or "
-                "remove handles until they agree",
+                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes, as "
+                "surface.fill_holes=true does with small ones, or remove handles until they agree",
                 kind="wrong_topology",
                 key=name,
             )

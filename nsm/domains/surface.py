@@ -20,8 +20,8 @@ from nsm.domains.names import stored as stored_domain
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
-from nsm.surfaces import topology
-from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies, seam_pairs
+from nsm.surfaces import holes, topology
+from nsm.surfaces.cutting import Cut, chords_joined, cut_to_disc, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays
@@ -45,7 +45,8 @@ class Surface:
         faces: (F, 3) int64, counter-clockwise in Ω.
         uv: (V, 2) float64 in Ω, or near it on a closed domain, without flipped triangles.
         domain: Ω.
-        source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
+        source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points; -2, -3,
+            ... in the middle of each hole that was filled.
         cut_vertex: (W,) int64, for each vertex of the mesh file its first copy here (or that of
             the vertex it was merged with); -1 if it is not on the surface.
         seam_pairs: (T, 2) int64, pairs of vertices that are copies of one point of the mesh.
@@ -339,10 +340,34 @@ class Surface:
 
         Returns:
             the first copies (W,) of the mesh file's vertices, in its order, without those that
-            were removed; and faces (F, 3) of numbers among these.
+            were removed, and then those in filled holes; and faces (F, 3) of numbers among these.
         """
-        _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
+        source, last = self.source_vertex, int(self.source_vertex.max())
+        order = np.where(source < 0, last - source, source)
+        _, first, number = np.unique(order, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    @property
+    def filled(self) -> np.ndarray:
+        """Mask (F,) of the faces over holes that were filled."""
+        if self.source_vertex.min() > holes.FIRST:
+            return np.zeros(len(self.faces), dtype=bool)
+        joined, _, number = chords_joined(self.faces, self.source_vertex == -1)
+        return np.asarray((self.source_vertex[joined] <= holes.FIRST).any(axis=1)[number])
+
+    def shown(self) -> tuple[np.ndarray, np.ndarray]:
+        """What files have of the mesh: vertices (W,), and faces (F, 3) of numbers among them.
+
+        Those of the cut mesh, or, on a closed domain, of :meth:`whole`, without filled holes.
+        """
+        vertices, faces = np.arange(len(self.vertices)), self.faces
+        if not self.domain.has_boundary:
+            vertices, faces = self.whole()
+        filled = self.filled
+        if not filled.any():
+            return vertices, faces
+        used, number = topology.renumbered(faces[~filled], len(vertices))
+        return vertices[used], number[faces[~filled]]
 
     @property
     def topology(self) -> tuple[int, int]:

@@ -82,11 +82,11 @@ class ParamTask(Task):
 
     def write_artefacts(self, folder: Path, result: Parameterization) -> None:
         surface = self.surface
-        inside = _into_square(result.uv)
+        shown, faces = surface.shown()
+        inside, points = _into_square(result.uv[shown]), surface.vertices[shown]
         for ending, texture in (("obj", None), ("glb", checkerboard())):
-            file = folder / f"parameterized.{ending}"
-            export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
-        write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
+            export_mesh(folder / f"parameterized.{ending}", points, faces, inside, texture=texture)
+        write_patterns(folder / "pattern", result.uv[shown] / surface.scale, faces)
         before_after = {"before: domain Ω": surface.uv, "after": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 

@@ -118,6 +118,7 @@ def propose_landmarks(
         )
     ends = (source.source_vertex, target.source_vertex)
     pairs = [np.stack([ids[h.vertices[:, k]] for k, ids in enumerate(ends)], axis=1) for h in found]
+    pairs = [own[(own >= 0).all(axis=1)] for own in pairs]  # not in the middle of filled holes
     line = _said(proposal, len(pairs[alternative]))
     if strict and not proposal.sure:
         raise NsmError(

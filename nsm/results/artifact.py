@@ -17,6 +17,7 @@ from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, check_points
+from nsm.surfaces.holes import FIRST
 
 FORMAT = "nsm-surface"
 STEM = "surface"
@@ -76,13 +77,10 @@ class NeuralSurface:
         """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2).
 
         On a closed domain these are the vertices and faces of the mesh file, without copies, so
-        that the mesh is closed; uv is then one lift of each vertex.
+        that the mesh is closed; uv is then one lift of each vertex. Filled holes are left out.
         """
-        surface = self.surface
-        if surface.domain.has_boundary:
-            return self(surface.uv), surface.faces, surface.uv
-        first, faces = surface.whole()
-        return self(surface.uv[first]), faces, surface.uv[first]
+        uv, (shown, faces) = self.surface.uv, self.surface.shown()
+        return self(uv[shown]), faces, uv[shown]
 
     def in_original_units(self, points: np.ndarray) -> np.ndarray:
         """Normalised points (N, 3) in the units and place of the mesh file.
@@ -180,8 +178,8 @@ def _check_arrays(surface: Surface) -> None:
         whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
         if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")
-    if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
-        raise ValueError("no faces, or source_vertex below -1")
+    if len(surface.faces) == 0 or surface.source_vertex.min() < FIRST - count:
+        raise ValueError("no faces, or more filled holes than vertices")
     cut = surface.cut_vertex
     if cut.ndim != 1 or not surface.source_vertex.max() < len(cut):
         raise ValueError("source_vertex names a vertex that the mesh file does not have")

@@ -87,15 +87,16 @@ def export_surface(
     (V, 2); arguments and errors as for :func:`export_mesh`.
 
     A surface on a closed domain is written whole, with the vertices and faces of its file and
-    without coordinates.
+    without coordinates. Filled holes are left out.
     """
     glb = Path(path).suffix.lower() == ".glb"
+    shown, faces = surface.shown()
     if surface.domain.has_boundary:
-        export_mesh(path, vertices, surface.faces, uv, texture=checkerboard() if glb else None)
+        texture = checkerboard() if glb else None
+        export_mesh(path, vertices[shown], faces, uv[shown], texture=texture)
         return
-    first, faces = surface.whole()
-    colours = checkerboard_at(uv[first]) if glb else None
-    export_mesh(path, vertices[first], faces, None, colours=colours)
+    colours = checkerboard_at(uv[shown]) if glb else None
+    export_mesh(path, vertices[shown], faces, None, colours=colours)
 
 
 def _glb(

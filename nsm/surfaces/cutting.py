@@ -337,7 +337,9 @@ _PIECES = {
 }
 
 
-def chords_joined(faces: np.ndarray, inserted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def chords_joined(
+    faces: np.ndarray, inserted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The faces of a disc before its chords were split.
 
     Args:
@@ -345,18 +347,24 @@ def chords_joined(faces: np.ndarray, inserted: np.ndarray) -> tuple[np.ndarray, 
         inserted: (W,) mask of the vertices that it inserted.
 
     Returns:
-        Faces (F, 3), and a mask (F,) of those that were in pieces.
+        Faces (F, 3), a mask (F,) of those that were in pieces, and for each given face (G,) which
+        of these it is, or is a piece of.
     """
     is_piece = inserted[faces].any(axis=1)
-    pieces, joined, at = faces[is_piece], [], 0
+    pieces, joined, counts, at = faces[is_piece], [], [], 0
     while at < len(pieces):
         first, second, third = inserted[pieces[at]].tolist()
         count, own = _PIECES[first, second, third]
         joined.append([int(pieces[at + row, corner]) for row, corner in own])
+        counts.append(count)
         at += count
     whole = faces[~is_piece]
     in_pieces = np.arange(len(whole) + len(joined)) >= len(whole)
-    return np.concatenate([whole, np.array(joined, dtype=np.int64).reshape(-1, 3)]), in_pieces
+    number = np.empty(len(faces), dtype=np.int64)
+    number[~is_piece] = np.arange(len(whole))
+    number[is_piece] = len(whole) + np.repeat(np.arange(len(joined)), counts)
+    every = np.concatenate([whole, np.array(joined, dtype=np.int64).reshape(-1, 3)])
+    return every, in_pieces, number
 
 
 def seam_pairs(origin: np.ndarray) -> np.ndarray:
