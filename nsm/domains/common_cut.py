@@ -27,7 +27,7 @@ from nsm.surfaces.location import locate
 from nsm.surfaces.validation import CleanMesh
 
 # seam=auto tries seams through these shares of the landmarks
-_SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
+SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
 _DISC = Disc()  # where seams are compared, whatever the domain
 _WORST = 1e3  # upper bound on a triangle's distortion
 
@@ -71,7 +71,7 @@ def best_common_cut(
         counts = (
             [seam_landmarks]
             if seam_landmarks
-            else sorted({max(2, round(share * total)) for share in _SHARES})
+            else sorted({max(2, round(share * total)) for share in SHARES})
         )
         ways = list(itertools.product(SEAMS, counts))
         tried = []
@@ -79,7 +79,7 @@ def best_common_cut(
             at("trying seams", k, len(ways))
             way = _common_cut(names, cleaned, landmarks, path, costs[path], count, others)
             if way is not None:
-                tried.append((_disagreement(way, landmarks), k, way))
+                tried.append((disagreement(way, landmarks), k, way))
         best = min(tried, default=(0.0, 0, None))[2]
     else:
         count = seam_landmarks or total
@@ -123,7 +123,7 @@ def _common_cut(
     return CommonCut(seam, len(chosen), cuts, [k[:, 1] for k in keys])
 
 
-def _disagreement(way: CommonCut, landmarks: Sequence[np.ndarray]) -> float:
+def disagreement(way: CommonCut, landmarks: Sequence[np.ndarray]) -> float:
     """How badly the domains agree: the distortion of the identity between two domains, times how
     far it misses the landmarks off the seam.
 

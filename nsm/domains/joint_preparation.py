@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from nsm.domains.base import BoundedDomain, Domain, Keys
+from nsm.domains.common_boundaries import best_common_boundaries, needs_common_boundaries
 from nsm.domains.common_cut import best_common_cut, common_fractions
 from nsm.domains.common_seams import aligned_keys, boundary_keys
 from nsm.domains.names import bounded
@@ -48,7 +49,8 @@ def prepare_jointly(
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
     For a domain with boundary, closed genus-0 meshes with two landmarks or more are cut along
-    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. On
+    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. So
+    are open ones with several boundaries; boundaries that correspond have the same places then. On
     the orbifold, meshes with four landmarks or more get the same four as their cones, those whose
     domains are least distorted in the mean. Other meshes are prepared one by one.
 
@@ -72,10 +74,17 @@ def prepare_jointly(
     everywhere: np.ndarray = np.all(np.stack(found) >= 0, axis=0)
     common_ids = [ids[everywhere] for ids in found]
     enough = everywhere.sum() >= 2 if domain.has_boundary else len(distinct(common_ids)) >= 4
-    apart = seam == "own" and domain.has_boundary
+    apart = (seam == "own" and domain.has_boundary) or len(meshes) == 1
     kinds = [topology.genus_and_boundary(c.faces) for c in cleaned]
     common = check_common_topology([m.name for m in meshes], kinds)
-    if common != (0, 0) or not enough or apart:
+    genus, loops = common
+    several = (
+        domain.has_boundary
+        and loops > 0
+        and genus == 0
+        and needs_common_boundaries(cleaned, common_ids[0])
+    )
+    if apart or not several and (common != (0, 0) or not enough):
         return [
             Surface.from_arrays(
                 m.vertices,
@@ -111,8 +120,17 @@ def prepare_jointly(
                 if s is not None
             ]
     if domain.has_boundary:
+        number = int(digest.hexdigest()[:15], 16)
         surfaces = _cut_and_embed(
-            meshes, cleaned, found, everywhere, domain, parameterization, seam, seam_landmarks
+            meshes,
+            cleaned,
+            found,
+            everywhere,
+            domain,
+            parameterization,
+            seam,
+            seam_landmarks,
+            number,
         )
     else:
         surfaces = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization)
@@ -189,32 +207,61 @@ def _cut_and_embed(
     method: str,
     seam: str,
     seam_landmarks: int | None,
+    number: int,
 ) -> list[Surface]:
     """The meshes cut through landmarks that all have, mask (L,), and past all others."""
     names = [m.name for m in meshes]
     common = [ids[everywhere] for ids in landmarks]
     others = [ids[~everywhere & (ids >= 0)] for ids in landmarks]
-    best = best_common_cut(names, cleaned, common, seam, seam_landmarks, others)
+    what = names, cleaned, common, seam, seam_landmarks, others
+    ends: Sequence[np.ndarray | None] = [None] * len(meshes)
+    said: list[tuple[str, ...]] = [()] * len(meshes)
+    if topology.boundary_loops(cleaned[0].faces):
+        best, found, lines = best_common_boundaries(*what)
+        own = zip(cleaned, found, strict=True)
+        ends = [np.array([number, *c.source_vertex[vertices]]) for c, vertices in own]
+        said = [(line,) for line in lines]
+    else:
+        best = best_common_cut(*what)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     line = (
         f"seam led along {best.seam} paths through {best.count} of {len(common[0])} landmarks, "
         "the same on all meshes"
     )
     return [
-        Surface.from_cut(
-            cut,
-            c,
-            name=m.name,
-            domain=domain,
-            parameterization=method,
-            keys=Keys(key, fractions),
-            log=(*m.log, *c.log, line),
+        replace(
+            Surface.from_cut(
+                cut,
+                c,
+                name=m.name,
+                domain=domain,
+                parameterization=method,
+                keys=Keys(key, fractions),
+                log=(*m.log, *c.log, *more, line),
+            ),
+            ends=end,
         )
-        for m, c, cut, key in counted(
+        for m, c, cut, key, end, more in counted(
             "layout on the domain",
-            list(zip(meshes, cleaned, best.cuts, best.keys, strict=True)),
+            list(zip(meshes, cleaned, best.cuts, best.keys, ends, said, strict=True)),
         )
     ]
+
+
+def with_ends(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Landmarks (L,) of surfaces, and after them the corresponding vertices (L + J,) at which the
+    cuts end on the boundaries, if the surfaces were cut together."""
+    ends = [s.ends[1:] for s in surfaces if s.ends is not None]
+    if not cut_together(surfaces) or not ends:
+        return list(landmarks)
+    known = np.any([np.isin(e, ids) for e, ids in zip(ends, landmarks, strict=True)], axis=0)
+    return [np.concatenate([ids, e[~known]]) for ids, e in zip(landmarks, ends, strict=True)]
+
+
+def cut_together(surfaces: Sequence[Surface]) -> bool:
+    """Whether the cuts between the boundaries of open surfaces correspond."""
+    numbers = {None if s.ends is None else int(s.ends[0]) for s in surfaces}
+    return len(numbers) == 1 and None not in numbers
 
 
 @dataclass(frozen=True)

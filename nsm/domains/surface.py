@@ -28,7 +28,7 @@ from nsm.surfaces.loading import as_arrays
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
-OPTIONAL = ("lattice",)
+OPTIONAL = ("lattice", "ends")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,9 @@ class Surface:
         log: repairs, conversions and cuts, a line each.
         lattice: (2, 2) on a closed domain: the surface is least distorted in the plane of
             (lattice / 2) uv, where it has the area of Ω. None elsewhere.
+        ends: of open meshes cut together, (1 + J,) int64: a number that is the same for all of
+            these, and the vertices of the mesh file at which the cuts end on the boundaries, which
+            correspond. None elsewhere.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
             a surface of a run folder.
     """
@@ -72,6 +75,7 @@ class Surface:
     quality: dict[str, float] = field(default_factory=dict, repr=False)
     log: tuple[str, ...] = field(default=(), repr=False)
     lattice: np.ndarray | None = field(default=None, repr=False)
+    ends: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @classmethod

@@ -14,7 +14,7 @@ import torch
 from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
-from nsm.domains.joint_preparation import Matched, Mesh, matched_landmarks
+from nsm.domains.joint_preparation import Matched, Mesh, matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import alignments_to_first
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
@@ -97,6 +97,7 @@ class CollectionMapTask(Task):
         """Take the surfaces, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(surfaces=phis))
         refuse_other_topology(phis)
+        ids = with_ends([phi.surface for phi in phis], ids)
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)

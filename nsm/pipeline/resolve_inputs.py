@@ -14,8 +14,10 @@ from nsm.domains import Domain, Surface, domain
 from nsm.domains.joint_preparation import (
     Mesh,
     check_common_topology,
+    cut_together,
     matched_landmarks,
     prepare_jointly,
+    with_ends,
 )
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC, AnalyticSurface
@@ -105,11 +107,25 @@ def refuse_other_topology(surfaces: Sequence[NeuralSurface]) -> None:
     meshes; an analytic target is an exception: a closed surface may be torn open for it.
 
     Raises:
-        NsmError: ``wrong_topology``: genus or number of boundary loops differ.
+        NsmError: ``wrong_topology``: genus or number of boundary loops differ; ``no_common_seam``:
+            surfaces with several boundaries that were cut apart from each other.
     """
-    meshes = [phi.surface for phi in surfaces if not isinstance(phi.map, AnalyticSurface)]
-    if len(meshes) > 1:
-        check_common_topology([s.name for s in meshes], [s.topology for s in meshes])
+    _refuse([phi.surface for phi in surfaces if not isinstance(phi.map, AnalyticSurface)])
+
+
+def _refuse(meshes: Sequence[Surface]) -> None:
+    if len(meshes) < 2:
+        return
+    names = [s.name for s in meshes]
+    genus, loops = check_common_topology(names, [s.topology for s in meshes])
+    if genus == 0 and loops > 1 and not cut_together(meshes):
+        raise NsmError(
+            f"{' and '.join(names)} have {loops} boundaries each and were not cut together, so "
+            "that no map takes boundaries to boundaries: give the mesh files of all, without "
+            "seam.path=own; or fill small holes with surface.fill_holes=true",
+            kind="no_common_seam",
+            key=names[0],
+        )
 
 
 def vertex_count(shape: Shape) -> int:
@@ -121,7 +137,7 @@ def _check_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray
     """NsmError for meshes that the landmarks do not put into correspondence, before the networks
     are trained."""
     try:
-        matched_landmarks(surfaces, landmarks)
+        matched_landmarks(surfaces, with_ends(surfaces, landmarks))
     except NsmError as error:
         if error.kind != "no_common_seam":
             raise
@@ -158,6 +174,8 @@ def neural_surfaces(
                 cache=config.surface.cache,
                 repairs=configured_repairs(config),
             )
+        known = [phi.surface for phi in ready.values() if not isinstance(phi.map, AnalyticSurface)]
+        _refuse([*prepared, *known])
         if not ready:
             _check_landmarks(prepared, landmarks)
         for surface in prepared:

@@ -175,7 +175,7 @@ def _check_arrays(surface: Surface) -> None:
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
     for name, array in surface.arrays().items():
-        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
+        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs", "ends")
         if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")
     if len(surface.faces) == 0 or surface.source_vertex.min() < FIRST - count:

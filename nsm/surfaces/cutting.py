@@ -150,7 +150,7 @@ def cut_to_disc(
         if not graph.loops and genus == 0 and len(terminals) < 2:
             reason = "the surface is closed; give at least two different seam vertices"
             raise _seam_error(name, "too_few", reason)
-    elif genus == 0 and _almost_closed(vertices, faces, graph.loops):
+    elif genus == 0 and almost_closed(vertices, faces, graph.loops):
         farthest = _farthest_points(graph, terminals, FARTHEST_POINTS)
         terminals += [v for v in farthest if v not in terminals]
         log.append(f"seam through {len(farthest)} farthest points")
@@ -199,7 +199,8 @@ def _cut_open(
     return Cut(points, cut_faces, origin, seam_pairs(origin), loop, tuple(log))
 
 
-def _almost_closed(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> bool:
+def almost_closed(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> bool:
+    """Whether all boundary loops of a mesh (V, 3), (F, 3) are small, or there are none."""
     sides = [vertices[loop] - vertices[np.roll(loop, -1)] for loop in loops]
     longest = max((float(np.linalg.norm(side, axis=1).sum()) for side in sides), default=0.0)
     return longest < SMALL_BOUNDARY * float(np.sqrt(topology.face_areas(vertices, faces).sum()))

@@ -7,6 +7,8 @@ of the hole's own vertices may use an edge that the mesh has already.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from nsm.surfaces import topology
@@ -43,13 +45,21 @@ def fill(
         (holes if small else left).append(loop)
     if not holes:
         return vertices, faces, []
-    centres = np.stack([vertices[loop].mean(axis=0) for loop in holes])
-    fans = [
-        np.stack([np.roll(loop, -1), loop, np.full(len(loop), len(vertices) + k)], axis=1)
-        for k, loop in enumerate(holes)
-    ]
     sizes = ", ".join(str(len(loop)) for loop in holes[:8]) + (", ..." if len(holes) > 8 else "")
     kept = ", ".join(str(len(loop)) for loop in left[:8])
     line = f"{len(holes)} holes of {sizes} edges filled for the map, left out of exported meshes"
     line += f"; open boundaries of {kept} edges stay" if left else ""
-    return np.concatenate([vertices, centres]), np.concatenate([faces, *fans]), [line]
+    return *fans(vertices, faces, holes), [line]
+
+
+def fans(
+    vertices: np.ndarray, faces: np.ndarray, loops: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh (V, 3), (F, 3) with a fan over each of H boundary loops, around a new vertex at its
+    mean: vertices (V + H, 3) and faces, the new ones last."""
+    middles = np.stack([vertices[loop].mean(axis=0) for loop in loops])
+    over = [
+        np.stack([np.roll(loop, -1), loop, np.full(len(loop), len(vertices) + k)], axis=1)
+        for k, loop in enumerate(loops)
+    ]
+    return np.concatenate([vertices, middles]), np.concatenate([faces, *over])
