@@ -128,7 +128,7 @@ def test_landmarks_that_contradict_boundaries_are_refused(masks):
 
 
 def test_tubes_without_landmarks_are_cut_alike():
-    vertices, faces = cylinder()
+    vertices, faces = cylinder(32, 11)
     meshes = [Mesh("a", vertices, faces), Mesh("b", vertices * [1, 1, 1.5], faces)]
     none = [np.zeros(0, dtype=np.int64)] * 2
     options = {"seam": "shortest", "parameterization": "tutte"}
