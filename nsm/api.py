@@ -30,6 +30,8 @@ from nsm.results import (
     load_surface,
     load_surface_map,
 )
+from nsm.results.parameterization_atlas import FILE as ATLAS
+from nsm.results.parameterization_atlas import ParameterizationAtlas, load_atlas
 from nsm.run_directories import temporary_folder
 from nsm.sweeps import is_complete
 
@@ -77,7 +79,7 @@ def parameterize(
     folder: str | Path | None = None,
     progress: bool = True,
     **settings: Any,
-) -> Parameterization:
+) -> Parameterization | ParameterizationAtlas:
     """Flatten a neural surface to the plane with least distortion and a free boundary.
 
     Args:
@@ -87,7 +89,8 @@ def parameterize(
 
     Returns:
         The map with its new coordinates in ``uv``, and its figures beside those of libigl's
-        methods in ``metrics``.
+        methods in ``metrics``; or, where ``seams`` cut the mesh into several charts, an atlas of
+        such maps.
 
     Raises:
         NsmError: a setting that does not exist or cannot be used.
@@ -334,7 +337,7 @@ def _name(target: Any) -> Any:
 
 def load(
     folder: str | Path, *, trust: str | Sequence[str] = ()
-) -> NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection:
+) -> NeuralSurface | Parameterization | ParameterizationAtlas | SurfaceMap | SurfaceCollection:
     """Load the result of a run.
 
     Args:
@@ -360,6 +363,8 @@ def load(
         return load_collection(folder, trust=trust)
     if (place / "pair.json").exists():
         return load_surface_map(folder, trust=trust)
+    if (place / ATLAS).exists():
+        return load_atlas(folder, trust=trust)
     if (place / "map.json").exists():
         return load_parameterization(folder, trust=trust)
     if place.is_dir() and not list(place.glob("surface.*")):

@@ -437,6 +437,9 @@ class Settings:
             task=pair_map with two closed meshes of genus 0: landmarks are proposed.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
+        seams: of task=param: edges along which the mesh is cut, as a list of pairs of vertices or a
+            file of them; lines: the l lines of the OBJ file; uv: the borders of the islands of its
+            texture coordinates. Several charts are flattened one by one and packed into an atlas.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the
             materials of its file. It is baked to the target, as target_textured.obj and .glb; the
             target's own texture, if it has one, to the source.
@@ -458,6 +461,7 @@ class Settings:
     surfaces: str | list[Any] | None = None
     template: str | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
+    seams: str | list[Any] | None = None
     texture: str | None = None
     texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import torch
 
 from nsm.data import SurfaceData
 from nsm.domains.baselines import BASELINES
+from nsm.pipeline.charts import neural_charts
 from nsm.pipeline.surface_cache import neural_surface
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
@@ -22,6 +25,7 @@ from nsm.results import (
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
@@ -34,16 +38,43 @@ class ParamTask(Task):
     certified = True
     table = staticmethod(comparison_table)
     picture_name = "layout"
+    charts: Sequence[NeuralSurface] = ()  # into which given seams cut the mesh
 
     def inputs(self, given: Given) -> list[Any]:
         ready = self.config.phi.path if given.phi is None else given.phi
         return [] if ready is None else [ready]
 
     def prepare(self, given: Given) -> None:
-        phi = given.phi
-        if not isinstance(phi, NeuralSurface):
+        phi, seams = given.phi, self.settings.get("seams")  # absent in older run folders
+        if seams is not None:
+            self.keep_absolute("seams")
+            self.charts = neural_charts(self.config, self.console, phi, seams)
+            phi = self.charts[0]
+        elif not isinstance(phi, NeuralSurface):
             phi = neural_surface(self.config, self.console, phi)
         self.use(phi)
+
+    def parts(self) -> list[Task]:
+        return [self._part(phi) for phi in self.charts] if len(self.charts) > 1 else []
+
+    def _part(self, phi: NeuralSurface) -> Task:
+        part, config = ParamTask(self.name), copy.deepcopy(self.config)
+        config.artefacts = False  # those of the atlas are written
+        part.setup(config, self.console)
+        part.use(phi)
+        return part
+
+    def joined(self, results: list[Any]) -> ParameterizationAtlas:
+        return ParameterizationAtlas(results)
+
+    def figures(self, result: Parameterization | ParameterizationAtlas) -> dict[str, Any]:
+        if isinstance(result, Parameterization):
+            return {}
+        return {"surface": self.surface.name.rpartition("-")[0], "charts": len(result.charts)}
+
+    def inner_line(self, result: Parameterization) -> str:
+        median = result.metrics["nsm"]["symmetric_dirichlet_median"]
+        return f"flattened, median symmetric Dirichlet {median:.3f}"
 
     def use(self, phi: NeuralSurface) -> None:
         """Take the neural surface."""
@@ -63,7 +94,9 @@ class ParamTask(Task):
     def make_result(self, module: Any) -> Parameterization:
         return Parameterization(self.phi, frozen(module.map), {}, self.settings)
 
-    def measure(self, result: Parameterization) -> None:
+    def measure(self, result: Parameterization | ParameterizationAtlas) -> None:
+        if isinstance(result, ParameterizationAtlas):
+            return  # its charts are measured
         surface = self.surface
         maps = {"domain": surface.uv, "nsm": result.uv}
         for name, method in BASELINES.items():
@@ -80,7 +113,12 @@ class ParamTask(Task):
         image = layout_image(self.surface, uv.detach().cpu().double().numpy())
         return np.round(255 * image).astype(np.uint8)
 
-    def write_artefacts(self, folder: Path, result: Parameterization) -> None:
+    def write_artefacts(
+        self, folder: Path, result: Parameterization | ParameterizationAtlas
+    ) -> None:
+        if isinstance(result, ParameterizationAtlas):
+            result.export(folder)
+            return
         surface = self.surface
         shown, faces = surface.shown()
         inside, points = _into_square(result.uv[shown]), surface.vertices[shown]

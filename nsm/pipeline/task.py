@@ -198,6 +198,19 @@ class Task:
         """
         return False
 
+    def parts(self) -> list[Task]:
+        """Tasks of which this one consists, prepared, to be run one by one in folders of their own
+        (see :func:`nsm.pipeline.runner.run_parts`); none: it is trained itself."""
+        return []
+
+    def joined(self, results: list[Any]) -> Any:
+        """The result of a task that consists of parts, from theirs."""
+        raise NotImplementedError
+
+    def inner_line(self, result: Any) -> str:
+        """What is printed of a run that is part of another, after the surface's name."""
+        return f"neural surface, RMS distance {result.metrics['rms_percent']:.3f} % of the diagonal"
+
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""
         raise NotImplementedError

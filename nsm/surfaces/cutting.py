@@ -160,7 +160,7 @@ def cut_to_disc(
         log.append(
             f"cut along {len(seam)} edges (genus {genus}, {len(graph.loops)} boundary loops)"
         )
-    return _cut_open(vertices, faces, seam, log, name)
+    return cut_open(vertices, faces, seam, log, name)
 
 
 def cut_along_paths(
@@ -177,12 +177,23 @@ def cut_along_paths(
     low, high = np.concatenate(steps).astype(np.int64).T
     seam = np.searchsorted(keys, low * len(vertices) + high).tolist()
     log = [f"cut along {len(seam)} edges between {len(paths) + 1} landmarks"]
-    return _cut_open(vertices, faces, seam, log, name)
+    return cut_open(vertices, faces, seam, log, name)
 
 
-def _cut_open(
+def cut_open(
     vertices: np.ndarray, faces: np.ndarray, seam: list[int], log: list[str], name: str
 ) -> Cut:
+    """A mesh cut along the edges of a seam, which leaves a disc, with its chords split.
+
+    Args:
+        vertices, faces: the mesh (V, 3), (F, 3).
+        seam: numbers of the edges of :func:`nsm.surfaces.topology.edges_of`.
+        log: lines that say how it was found.
+        name: of the mesh, for messages.
+
+    Raises:
+        NsmError: ``not_a_disc``.
+    """
     is_cut = np.zeros(len(topology.edges_of(faces).pairs), dtype=bool)
     is_cut[seam] = True
     cut_faces, origin = topology.cut_along(faces, is_cut)
