@@ -206,7 +206,8 @@ class SurfaceSettings:
             refused.
         fill_holes: fill holes of at most so many edges for the map; true: small ones, shorter than
             half the square root of the area; exported meshes keep the holes.
-        parameterization: of the mesh over Ω: slim (low distortion) or tutte.
+        parameterization: of the mesh over Ω: slim (low distortion) or tutte; or given, of an OBJ,
+            PLY or GLB file: it is cut and laid out as its texture coordinates are.
         cache: keep the prepared surface on disk, under a hash of its content.
     """
 
@@ -217,7 +218,7 @@ class SurfaceSettings:
     parts: Literal["largest"] | Whole | None = None
     repair: Literal["split"] | None = None
     fill_holes: bool | Count = False
-    parameterization: Literal["slim", "tutte"] = "slim"
+    parameterization: Literal["slim", "tutte", "given"] = "slim"
     cache: bool = True
 
 

@@ -12,6 +12,7 @@ from nsm.domains.base import BoundedDomain, Domain, Keys
 from nsm.domains.common_boundaries import best_common_boundaries, needs_common_boundaries
 from nsm.domains.common_cut import best_common_cut, common_fractions
 from nsm.domains.common_seams import aligned_keys, boundary_keys
+from nsm.domains.embedding import GIVEN
 from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
@@ -69,6 +70,12 @@ def prepare_jointly(
             loops differ; ``no_common_seam``.
     """
     domain = domain_of(domain)
+    if parameterization == GIVEN:
+        raise NsmError(
+            "surface.parameterization=given: the meshes of a map are laid out alike; take slim",
+            kind="unknown_option",
+            key="surface.parameterization",
+        )
     cleaned = [clean(m.vertices, m.faces, m.name, repairs) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
     everywhere: np.ndarray = np.all(np.stack(found) >= 0, axis=0)

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.base import Domain, Keys
-from nsm.domains.embedding import check_method
+from nsm.domains.embedding import GIVEN, check_method
+from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given
+from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
@@ -25,6 +28,7 @@ from nsm.surfaces.cutting import Cut, chords_joined, cut_to_disc, first_copies, 
 from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays
+from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
@@ -101,7 +105,8 @@ class Surface:
             cones: for ``domain="orbifold"``, the four vertices (numbers in the file) at its cones,
                 in the order of (0, 0), (1, 0), (1, 1), (0, 1); by default extremities for which the
                 surface is least distorted.
-            parameterization: ``slim`` or ``tutte``; closed domains have ``slim`` only.
+            parameterization: ``slim`` or ``tutte``, or ``given``: the file's texture coordinates;
+                closed domains have ``slim`` only.
             cache: keep the prepared surface on disk, keyed by content.
             repairs: decisions on a mesh that is not one manifold.
 
@@ -115,6 +120,8 @@ class Surface:
                 key="path_or_name",
             )
         mesh = given_mesh(path_or_name, "path_or_name")
+        file = path_or_name if isinstance(path_or_name, (str, Path)) else ""
+        uv = read_uv(file) if parameterization == GIVEN and Path(file).is_file() else None
         return cls.from_arrays(
             mesh.vertices,
             mesh.faces,
@@ -126,6 +133,7 @@ class Surface:
             cache=cache,
             log=mesh.log,
             repairs=repairs,
+            uv=uv,
         )
 
     @classmethod
@@ -142,10 +150,12 @@ class Surface:
         cache: bool = False,
         log: Sequence[str] = (),
         repairs: Repairs = NO_DECISION,
+        uv: np.ndarray | None = None,
     ) -> Surface:
         """Validate, cut, normalise and parameterise a mesh (V, 3), (F, 3).
 
-        The arguments are those of :meth:`load`. ``quality`` holds flipped_triangles,
+        The arguments are those of :meth:`load`; ``uv`` (F, 3, 2) are texture coordinates at the
+        faces' corners, for ``parameterization="given"``. ``quality`` holds flipped_triangles,
         median_symmetric_dirichlet (of the map from Ω to the mesh) and seconds; on a domain with
         boundary also boundary_self_intersections, tutte_median_symmetric_dirichlet (for large
         meshes, Tutte's of the coarse mesh) and seam_vertices (the number of ``seam_pairs``). No
@@ -174,6 +184,9 @@ class Surface:
             options["cones"] = corners
         if repairs != NO_DECISION:
             options["repairs"] = asdict(repairs)
+        if parameterization == GIVEN:
+            given_uv = check_given(uv, faces, domain, seam, name)
+            options["uv"] = hashlib.sha256(given_uv.tobytes()).hexdigest()
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         raw = (vertices, faces)
@@ -186,7 +199,11 @@ class Surface:
             "parameterization": parameterization,
             "log": (*log, *mesh.log),
         }
-        if domain.has_boundary:
+        if parameterization == GIVEN:
+            assert uv is not None
+            cut, flat = cut_as_given(mesh, faces, uv, name)
+            surface = cls.from_cut(cut, mesh, **about, given=flat)
+        elif domain.has_boundary:
             if seam is not None:
                 seam = _merged(seam, mesh, name, "seam_vertices")
             cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
@@ -210,6 +227,7 @@ class Surface:
         parameterization: str = "slim",
         keys: Keys | None = None,
         log: Sequence[str] = (),
+        given: np.ndarray | None = None,
     ) -> Surface:
         """Normalise and parameterise a mesh that is a disc already.
 
@@ -217,6 +235,7 @@ class Surface:
             cut: the disc, with the vertices of the whole mesh that its own came from.
             mesh: the whole mesh.
             keys: boundary vertices held at given places of ∂Ω.
+            given: (V, 2) the disc in the plane, from which its layout starts.
             name, domain, parameterization, log: as for :meth:`from_arrays`.
 
         Raises:
@@ -226,7 +245,11 @@ class Surface:
         domain = domain_of(domain)
         centred, center, scale = _centred(cut.vertices, cut.faces, domain)
         normalised = centred * scale
-        flat = domain.embed(normalised, cut.faces, method=parameterization, name=name, keys=keys)
+        if given is None:
+            how: dict[str, Any] = {"method": parameterization, "name": name, "keys": keys}
+            flat = domain.embed(normalised, cut.faces, **how)
+        else:
+            flat = embedded_as_given(bounded(domain), cut, given, name)
         flipped = flipped_triangles(flat.uv, cut.faces)
         crossings = boundary_self_intersections(flat.uv, cut.loop) if domain.has_boundary else 0
         if flipped or crossings:

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Surface, domain
+from nsm.domains.embedding import GIVEN
 from nsm.errors import NsmError
 from nsm.pipeline.configured_surface import configured_repairs, named_mesh, report_surface
 from nsm.pipeline.surface_cache import cached_surfaces
@@ -39,6 +40,13 @@ def neural_charts(
     if isinstance(given, NeuralSurface) or config.phi.path is not None and given is None:
         raise NsmError(
             "seams: a neural surface is cut already; give its mesh, or leave the seams out",
+            kind="conflicting_settings",
+            key="seams",
+        )
+    if config.surface.parameterization == GIVEN:
+        raise NsmError(
+            "surface.parameterization=given: it cuts the mesh along its texture coordinates; leave "
+            "the seams out",
             kind="conflicting_settings",
             key="seams",
         )

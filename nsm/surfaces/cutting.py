@@ -202,7 +202,7 @@ def cut_open(
         found = f"Euler characteristic {euler}, {len(loops)} boundary loops"
         reason = f"the seam does not leave a disc ({found}); give other {_SEAM_KEY}"
         raise _seam_error(name, "not_a_disc", reason)
-    points, cut_faces, inserted = _split_chords(vertices[origin], cut_faces)
+    points, cut_faces, inserted = split_chords(vertices[origin], cut_faces)
     if inserted:
         log = [*log, f"{inserted} interior edges between boundary vertices split"]
     origin = np.concatenate([origin, np.full(inserted, -1)])
@@ -301,7 +301,7 @@ def _handle_loops(
     return result
 
 
-def _split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+def split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Split each interior edge between two boundary vertices at its midpoint.
 
     On a side of the square the triangles at such an edge would be degenerate, and on a circle
@@ -340,7 +340,7 @@ def _split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     return points, np.concatenate([faces[~touched], np.array(new, dtype=np.int64)]), inserted
 
 
-# The pieces that _split_chords makes of a face, by the inserted ones among the first one's corners,
+# The pieces that split_chords makes of a face, by the inserted ones among the first one's corners,
 # and where in the pieces (row, corner) the face's own corners are.
 _PIECES = {
     (False, True, False): (2, ((0, 0), (1, 1), (0, 2))),

@@ -37,7 +37,7 @@ def read_seams(given: Any, file: str | Path | None, faces: np.ndarray, name: str
         NsmError: ``missing_uv``, ``no_seams``, ``wrong_type``, ``not_an_edge``, or a file that
             cannot be read.
     """
-    if given in (UV, LINES):
+    if isinstance(given, str) and given in (UV, LINES):
         if file is None or not Path(file).is_file():
             reason = f"seams={given} are read from a mesh file; give one, or a list of edges"
             raise NsmError(f"{name}: {reason}", kind="wrong_type", key=_KEY)
