@@ -306,7 +306,7 @@ class TrainerSettings:
         stop_gradient_norm: stop when the norm of the gradient, averaged over ``stop_window``
             steps, falls below this; null: never.
         stop_norm_of: the loss whose norm is meant: mean over the batch, as it is trained; or sum,
-            the mean's times ``data.batch_size``.
+            the mean's times the number of samples in the batch.
         stop_window: steps over which the norm is averaged.
         threads: of the CPU; the default networks are so small that one is fastest. null: what
             torch chooses, for large networks.
@@ -415,6 +415,26 @@ class PairConstraints(Checked):
     fold_margin: Share = 0.1
     fold_every: Count = 25
     multipliers_from: Share = 0.0
+
+
+@dataclass(frozen=True)
+class CollectionConstraints(PairConstraints):
+    """How task=collection_map constrains its maps.
+
+    Args:
+        boundary: exact: every h_i keeps to the domain by construction; penalty: λ_B pulls the image
+            of the boundary to ∂Ω.
+        landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
+        multiplier_every: steps between two updates of the multipliers.
+        ramp: share of the steps over which the weights of landmarks and seam rise to their values.
+        fold_margin: what the determinant of J_h must stay above at the mesh triangles.
+        fold_every: steps between two looks for the mesh triangles nearest to folding.
+        multipliers_from: share of the steps before the multipliers' first update.
+        pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
+            mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.
+    """
+
+    pairs: Literal["mean", "sum"] = "mean"
 
 
 @dataclass

@@ -33,10 +33,8 @@ FILES = sorted(
 TASKS = {
     ("loss_weights", "param"): "param",
     ("loss_weights", "pair"): "pair_map",
-    ("loss_weights", "paper_pair"): "pair_map",
     ("constraints", "param"): "param",
     ("constraints", "pair"): "pair_map",
-    ("constraints", "paper_pair"): "collection_map",
     ("constraints", "fast_pair"): "pair_map",
     ("experiment", "fast"): "pair_map",
     ("published", "param"): "param",
@@ -147,15 +145,13 @@ def test_it_composes_within_the_callers_hydra_main(tmp_path, monkeypatch):
 
 
 def test_groups_can_be_changed_separately():
-    config = compose_config(["task=pair_map", "data=paper", "loss_weights=paper_pair"])
-    assert (config.data.batch_size, config.sampler.pool) == (4000, 500_000)
-    assert config.constraints.boundary == "exact"
-    assert config.loss_weights.seam == 0
-    config = compose_config(["task=pair_map", "data=paper", "sampler=fresh", "domain=square"])
-    assert (config.data.batch_size, config.sampler.pool) == (4000, None)
+    config = compose_config(["task=pair_map", "data=levels", "sampler=pool", "domain=square"])
+    assert (config.data.points[0], config.sampler.pool) == (2048, 500_000)
     assert config.domain._target_ == "nsm.domains.Square"
-    config = compose_config(["task=pair_map", "constraints=paper_pair", "loss_weights=pair"])
-    assert (config.constraints.boundary, config.loss_weights.seam) == ("penalty", 1e3)
+    config = compose_config(["task=pair_map", "constraints=fast_pair"])
+    assert (config.constraints.multiplier_every, config.loss_weights.seam) == (1, 1e3)
+    config = compose_config(["task=pair_map", "experiment=paper", "constraints=fast_pair"])
+    assert (config.constraints.multiplier_every, config.map.width) == (1, 128)
 
 
 @pytest.mark.parametrize(

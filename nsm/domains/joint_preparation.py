@@ -122,7 +122,7 @@ def prepare_jointly(
         stored = [cache_.read(key) for key in names]
         if all(s is not None for s in stored):
             return [
-                Surface.from_stored(m.name, domain, s)
+                replace(Surface.from_stored(m.name, domain, s), raw=(m.vertices, m.faces))
                 for m, s in zip(meshes, stored, strict=True)
                 if s is not None
             ]
@@ -144,7 +144,10 @@ def prepare_jointly(
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
-    return surfaces
+    return [
+        replace(surface, raw=(m.vertices, m.faces))
+        for m, surface in zip(meshes, surfaces, strict=True)
+    ]
 
 
 def _with_common_cones(

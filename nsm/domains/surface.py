@@ -63,7 +63,7 @@ class Surface:
             these, and the vertices of the mesh file at which the cuts end on the boundaries, which
             correspond. None elsewhere.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
-            a surface of a run folder.
+            an analytic surface, and for one that an older version stored.
     """
 
     name: str
@@ -373,6 +373,16 @@ class Surface:
         order = np.where(source < 0, last - source, source)
         _, first, number = np.unique(order, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    def file_faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """The faces before copies were made and points inserted, without filled holes.
+
+        Returns:
+            Faces (G, 3) of vertices of the mesh file, and the same (G, 3) of vertices here.
+        """
+        corners = chords_joined(self.faces, self.source_vertex == -1)[0]
+        corners = corners[(self.source_vertex[corners] >= 0).all(axis=1)]
+        return self.source_vertex[corners], corners
 
     @property
     def filled(self) -> np.ndarray:

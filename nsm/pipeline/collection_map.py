@@ -38,11 +38,18 @@ from nsm.results import (
     transfer_matrix_picture,
     warning_of_tears,
 )
+from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import export_ply
 from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import start_figures
 from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
-from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import (
+    aligned,
+    carried,
+    landmark_rotation,
+    least_distorting_rotation,
+)
 
 _SEAM_POINTS = 24  # on each branch
 _RINGS = 80  # of an even mesh of the common domain
@@ -137,10 +144,17 @@ class CollectionMapTask(Task):
         return f"{self.name} of {len(self.phis)} surfaces"
 
     def build(self) -> Any:
+        points, targets = self.points, self.targets
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
+            # as for pairs: the corners are key points (METHOD)
+            corners = torch.from_numpy(self.domain.corners).to(points)
+            points = torch.cat([points, corners])
+            kept = torch.stack([start.before(corners) for start in self.starts])
+            targets = torch.cat([targets, kept], dim=1)
         return self.module(
             **self.map_settings(),
-            points=self.points,
-            targets=self.targets,
+            points=points,
+            targets=targets,
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
             starts=self.starts,
             mesh=self._mesh(),
@@ -192,6 +206,15 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+        for (i, j), name in result.pair_names.items():
+            figures = result.metrics["pairs"][name]
+            source, target = self.phis[i].surface, self.phis[j].surface
+            if self.trained is not None:
+                before = flipped_percent(self.trained.pair(i, j).image_uv, source.faces)
+                figures["flipped_before_repair_percent"] = before
+            ends = self.starts[j], self.starts[i]
+            first, places = (carried(x, *ends) for x in (source.uv, self.matched.points[i]))
+            figures |= start_figures(source, target, first, places, self.matched.points[j])
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
         every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())

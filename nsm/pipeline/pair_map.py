@@ -37,7 +37,6 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     distortion_picture,
-    export_mesh,
     export_surface,
     isotopy_table,
     map_image,
@@ -48,9 +47,16 @@ from nsm.results import (
     transfer_picture,
     warning_of_tears,
 )
+from nsm.results.map_metrics import flipped_percent
 from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import start_figures
 from nsm.tasks import PairMap
-from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import (
+    aligned,
+    carried,
+    landmark_rotation,
+    least_distorting_rotation,
+)
 
 _MORPH_FRAMES = 9
 _CLASSES_SHOWN, _CLASSES_TRIED = 4, 3
@@ -125,7 +131,7 @@ class PairMapTask(Task):
             torch.as_tensor(array, dtype=torch.float32)
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
-        start = self._start(p, q)
+        self.start = start = self._start(p, q)
         phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
@@ -214,6 +220,11 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        if self.trained is not None:
+            before = flipped_percent(self.trained.image_uv, source.faces)
+            result.metrics["flipped_before_repair_percent"] = before
+        first, places = (carried(x, self.start) for x in (source.uv, points))
+        result.metrics.update(start_figures(source, target, first, places, targets))
         if len(source.seam_pairs) and source.domain.has_boundary:
             result.metrics.update(result.weld.figures(target.bounding_box_diagonal))
 
@@ -270,8 +281,5 @@ def _write_image(folder: Path, f: SurfaceMap) -> None:
     image = f.target.in_original_units(f.welded_image)
     np.save(folder / "mapped_vertices.npy", image)
     points = f.target.in_original_units(weld.points)
-    export_surface(folder / "mapped.glb", points, s, s.uv)
-    if s.domain.has_boundary:
-        export_mesh(folder / "mapped.obj", image, weld.faces, s.uv, corners=weld.corners)
-    else:
-        export_surface(folder / "mapped.obj", points, s, s.uv)
+    for ending in (".obj", ".glb"):
+        export_surface(folder / f"mapped{ending}", points, s, s.uv)

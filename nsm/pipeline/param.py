@@ -18,13 +18,13 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     Parameterization,
-    checkerboard,
     comparison_table,
-    export_mesh,
+    export_surface,
     layout_image,
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.map_metrics import flipped_percent
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
@@ -107,6 +107,10 @@ class ParamTask(Task):
         for name, uv in maps.items():
             result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
         result.metrics["nsm"].update(result.certificate)
+        if self.trained is not None:
+            result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(
+                self.trained.uv, surface.faces, mirrored=True
+            )
 
     def picture(self, module: Any) -> np.ndarray:
         uv = module(torch.as_tensor(self.surface.uv, dtype=torch.float32, device=module.device))
@@ -120,11 +124,12 @@ class ParamTask(Task):
             result.export(folder)
             return
         surface = self.surface
-        shown, faces = surface.shown()
-        inside, points = _into_square(result.uv[shown]), surface.vertices[shown]
-        for ending, texture in (("obj", None), ("glb", checkerboard())):
-            export_mesh(folder / f"parameterized.{ending}", points, faces, inside, texture=texture)
-        write_patterns(folder / "pattern", result.uv[shown] / surface.scale, faces)
+        inside = _into_square(result.uv)
+        vertices = self.phi.in_original_units(surface.vertices)
+        for ending in (".obj", ".glb"):
+            export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
+        faces = surface.faces[~surface.filled]
+        write_patterns(folder / "pattern", result.uv / surface.scale, faces)
         before_after = {"before: domain Ω": surface.uv, "after": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 

@@ -61,8 +61,8 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
     if isinstance(given, Surface):
         if given.raw is None:
             raise NsmError(
-                f"{key}={given.name}: a surface of a run folder has no mesh to prepare again; give "
-                "its neural surface or the mesh file",
+                f"{key}={given.name}: no mesh of a file is known to prepare it again; give its "
+                "neural surface or the mesh file",
                 kind="wrong_type",
                 key=key,
             )

@@ -144,7 +144,12 @@ def trained(
     guard = DivergenceGuard(console)
     callbacks: list[Callback] = [
         guard,
-        GradientWatch(settings.log_every, _stop_norm(config), settings.stop_window),
+        GradientWatch(
+            settings.log_every,
+            settings.stop_gradient_norm,
+            settings.stop_window,
+            summed=settings.stop_norm_of == "sum",
+        ),
         AtomicCheckpoint(*(run.folder / CHECKPOINT_FILE for run in runs)),
         *_own_callbacks(config),
     ]
@@ -217,14 +222,6 @@ def trained(
         take_over(trainer, folder / CHECKPOINT_FILE)
         trainer.loggers = loggers(trainer.global_step + 1)
     return trainer
-
-
-def _stop_norm(config: DictConfig) -> float | None:
-    """The norm of the mean loss's gradient under which the training stops."""
-    norm: float | None = config.trainer.stop_gradient_norm
-    if norm is None or config.trainer.stop_norm_of == "mean":
-        return norm
-    return norm / float(config.data.batch_size)
 
 
 def lightning_trainer(

@@ -11,8 +11,10 @@ from PIL import Image
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
+from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
 from nsm.results.textures import checkerboard, checkerboard_at
+from nsm.results.vertex_values import mean_by_file_vertex
 
 
 def export_mesh(
@@ -86,17 +88,23 @@ def export_surface(
     """Write a surface's mesh with other vertices (V, 3), and a checkerboard over coordinates uv
     (V, 2); arguments and errors as for :func:`export_mesh`.
 
-    A surface on a closed domain is written whole, with the vertices and faces of its file and
-    without coordinates. Filled holes are left out.
+    An OBJ file has the vertices and faces of the surface's file, in its order: the copies of a seam
+    vertex go to their mean, and keep their own texture coordinates. A GLB file has a vertex for
+    each copy. A surface on a closed domain is written whole, without coordinates. Filled holes are
+    left out.
     """
-    glb = Path(path).suffix.lower() == ".glb"
-    shown, faces = surface.shown()
-    if surface.domain.has_boundary:
-        texture = checkerboard() if glb else None
-        export_mesh(path, vertices[shown], faces, uv[shown], texture=texture)
+    bounded = surface.domain.has_boundary
+    if Path(path).suffix.lower() == ".glb":
+        shown, faces = surface.shown()
+        points, own = vertices[shown], uv[shown]
+        if bounded:
+            export_mesh(path, points, faces, own, texture=checkerboard())
+        else:
+            export_mesh(path, points, faces, None, colours=checkerboard_at(own))
         return
-    colours = checkerboard_at(uv[shown]) if glb else None
-    export_mesh(path, vertices[shown], faces, None, colours=colours)
+    faces, corners = faces_of_file(surface)
+    points = mean_by_file_vertex(surface, vertices)
+    export_mesh(path, points, faces, uv if bounded else None, corners=corners)
 
 
 def _glb(

@@ -13,6 +13,7 @@ from PIL import Image
 
 from nsm.domains import Surface
 from nsm.energies import symmetric_dirichlet
+from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
@@ -20,8 +21,8 @@ from nsm.results.render import Blend, View
 from nsm.results.surface_map import SurfaceMap
 
 _STRIP, _GIF = 300, 300
-_TICKS = [4, 5, 7, 10, 20]
-_WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
+_LEAST, _WORST = LEAST_SYMMETRIC_DIRICHLET, 20.0  # ends of the colour scale
+_TICKS = [_LEAST, 5, 7, 10, 20]
 
 
 def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
@@ -62,7 +63,7 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
         triangle_metric(s.vertices, s.faces), triangle_metric(f.image, s.faces)
     ).numpy()
     at_vertex = vertex_means(np.minimum(value, 1e3), s.faces, len(s.vertices))
-    scale = ScalarMappable(LogNorm(4, _WORST), "viridis")
+    scale = ScalarMappable(LogNorm(_LEAST, _WORST), "viridis")
     colours = scale.to_rgba(at_vertex)[:, :3]
 
     def paint(blend: Blend) -> np.ndarray:
@@ -85,7 +86,9 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     axes.clear()
     axes.set_aspect("auto")
     axes.set_position((0.64, 0.14, 0.24, 0.74))
-    axes.hist(np.clip(value, 4, _WORST), bins=np.geomspace(4, _WORST, 60), color="#345c8c")
+    axes.hist(
+        np.clip(value, _LEAST, _WORST), bins=np.geomspace(_LEAST, _WORST, 60), color="#345c8c"
+    )
     axes.set_xscale("log")
     axes.set_xticks(_TICKS, [*map(str, _TICKS[:-1]), f"≥ {_TICKS[-1]}"])
     axes.set_xticks([], minor=True)

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from nsm.errors import NsmError
+from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
 from nsm.results.meshes import export_mesh
 from nsm.results.parameterization import Parameterization, load_parameterization
 from nsm.results.patterns import write_patterns
 from nsm.results.textures import checkerboard
 from nsm.surfaces.atlas import packed
-from nsm.surfaces.cutting import chords_joined
 
 FILE = "atlas.json"
 
@@ -84,19 +84,13 @@ class ParameterizationAtlas:
         write_patterns(place / "pattern", uv / self.scale, faces)
         square = 2 * uv - 1
         export_mesh(place / "parameterized.glb", points, faces, square, texture=checkerboard())
-        if surfaces[0].raw is None:  # loaded
-            export_mesh(place / "parameterized.obj", points, faces, square)
-            return
-        joined = [chords_joined(s.faces, s.source_vertex == -1)[0] for s in surfaces]
-        own = np.concatenate([s.source_vertex[f] for s, f in zip(surfaces, joined, strict=True)])
-        corners = np.concatenate([f + n for f, n in zip(joined, first, strict=False)])
-        kept = (own >= 0).all(axis=1)
+        both = [faces_of_file(s) for s in surfaces]
         export_mesh(
             place / "parameterized.obj",
-            surfaces[0].raw[0],
-            own[kept],
+            self.charts[0].phi.file_mesh()[0],
+            np.concatenate([own for own, _ in both]),
             square,
-            corners=corners[kept],
+            corners=np.concatenate([c + n for (_, c), n in zip(both, first, strict=False)]),
         )
 
 

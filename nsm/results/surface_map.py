@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
+import torch
 from scipy.sparse import csr_matrix
-from torch import nn
+from torch import Tensor, nn
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
-from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.artifact import NeuralSurface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired, statement
-from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
+from nsm.results.composed_map import ComposedMap, composed
+from nsm.results.file_faces import FileFaces
+from nsm.results.files import write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.networks import placed_map
 from nsm.results.points import as_points, as_values
+from nsm.results.pointwise import SurfaceMapModule, fixed_image, moved, value_and_jacobian
 from nsm.results.textured_mesh import LARGEST_SIZE, TexturedMesh, painted, read_file_mesh
+from nsm.results.vertex_values import by_file_vertex, cut_mesh_matrix, on_cut_mesh
 from nsm.results.welding import Weld, weld
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.textures import read_texture
@@ -58,30 +62,116 @@ class SurfaceMap:
     correction: Correction = field(default_factory=Correction, repr=False)
     vertex_image: np.ndarray | None = field(default=None, repr=False)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
+    @overload
+    def __call__(self, points: np.ndarray) -> np.ndarray: ...
+    @overload
+    def __call__(self, points: Tensor) -> Tensor: ...
+    def __call__(self, points: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.
 
-        Points off the source start from the nearest point on it.
+        Points off the source start from the nearest point on it. For a tensor the result is one of
+        its type, on its device, with a gradient for the points; :meth:`module` has one for the
+        weights of h too.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
+        if isinstance(points, Tensor):
+            return moved(self, points, fixed_image(self))
         s, t = self.source.surface, self.target.surface
         image = _located(s, points, "points on the source").take(self.image_uv, s.faces)
         return self.target.in_original_units(t.at(image))
 
-    def inverse(self, points: np.ndarray) -> np.ndarray:
+    @overload
+    def inverse(self, points: np.ndarray) -> np.ndarray: ...
+    @overload
+    def inverse(self, points: Tensor) -> Tensor: ...
+    def inverse(self, points: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 3) anywhere on the target to those (N, 3) of the source that f sends there.
 
-        Points off the target start from the nearest point on it.
+        Points off the target start from the nearest point on it. Tensors as for :meth:`__call__`.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
+        if isinstance(points, Tensor):
+            return moved(self, points, fixed_image(self), back=True)
         s, t = self.source.surface, self.target.surface
         uv = _located(t, points, "points on the target").take(t.uv, t.faces)
         preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
         return self.source.in_original_units(s.at(preimage))
+
+    @overload
+    def value_and_jacobian(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+    @overload
+    def value_and_jacobian(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
+    def value_and_jacobian(
+        self, points: np.ndarray | Tensor
+    ) -> tuple[np.ndarray, np.ndarray] | tuple[Tensor, Tensor]:
+        """Images (N, 3) of points (N, 3) of the source, and Jacobians (N, 3, 3).
+
+        A Jacobian takes tangent vectors of the source to tangent vectors of the target, in the
+        units of the files, and the source's normal to zero. It is constant on the pieces of
+        triangles on which the map is affine.
+
+        Raises:
+            NsmError: as :meth:`__call__`.
+        """
+        if isinstance(points, Tensor):
+            return value_and_jacobian(self, points, fixed_image(self))
+        given = torch.from_numpy(as_points(points, 3, "points on the source"))
+        value, jacobian = value_and_jacobian(self, given, fixed_image(self))
+        return value.numpy(), jacobian.numpy()
+
+    def __matmul__(self, other: SurfaceMap | ComposedMap) -> ComposedMap:
+        """``g @ f``, the map x ↦ g(f(x)), where f ends on the mesh that g starts from.
+
+        Raises:
+            NsmError: ``wrong_mesh``: f ends on another mesh.
+        """
+        return composed(self, other)
+
+    def module(self) -> SurfaceMapModule:
+        """f as a torch module on points (N, 3), whose weights, those of h, can be trained."""
+        return SurfaceMapModule(self)
+
+    def to(self, device: torch.device | str) -> SurfaceMap:
+        """The same map with its networks on a device."""
+        return replace(
+            self,
+            source=self.source.to(device),
+            target=self.target.to(device),
+            map=copy.deepcopy(self.map).to(device),
+            vertex_image=self._uncorrected,
+        )
+
+    def correspondences(self, *, back: bool = False) -> Places:
+        """Where each vertex of the source's mesh file goes on the mesh of the target's.
+
+        The copies of a vertex on a seam have one image (see :attr:`weld`). Vertices that are not on
+        the surface, such as those of a part that was left out, go with the nearest point on it.
+
+        Args:
+            back: where each vertex of the target's file comes from on the source's mesh.
+
+        Returns:
+            face (W,), the rows of ``target.file_mesh()``'s faces, and barycentric coordinates
+            (W, 3) in them: ``face, weights = f.correspondences()``.
+        """
+        end = self.source if back else self.target
+        files = FileFaces(end.surface, *end.file_mesh(), end.surface.name)
+        return files.to_file(self._of_file_vertices(back))
+
+    def _of_file_vertices(self, back: bool) -> Places:
+        start = self.target if back else self.source
+        own = self._back if back else self.weld.places
+        face, weights = (by_file_vertex(start.surface, array) for array in own)
+        absent = np.flatnonzero(start.surface.cut_vertex < 0)
+        if len(absent):
+            points = start.file_mesh()[0][absent]
+            near = self.places(_located(start.surface, points, "vertices"), back=back)
+            face[absent], weights[absent] = near
+        return Places(face, weights)
 
     def planar(self, uv: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the source's domain to those of the target's, (N, 2).
@@ -157,7 +247,8 @@ class SurfaceMap:
     def welded_image(self) -> np.ndarray:
         """Images (W, 3) of the mesh file's vertices on the target, welded, in normalised units;
         with the faces of ``weld`` the image of a closed mesh is closed."""
-        return by_file_vertex(self.source.surface, self.weld.points)
+        t = self.target.surface
+        return self._of_file_vertices(False).take(t.vertices, t.faces)
 
     @cached_property
     def _forth(self) -> Places:
@@ -297,77 +388,6 @@ class SurfaceMap:
             "config": self.config,
         }
         write_pair(place / STEM, FORMAT, tensors, metadata)
-
-
-def load_surface_map(folder: str | Path, trust: Iterable[str] = ()) -> SurfaceMap:
-    """Read what :meth:`SurfaceMap.save` wrote.
-
-    Args, Raises:
-        as for :func:`nsm.results.load_surface`.
-    """
-    place = Path(folder)
-    tensors, metadata = read_pair(place / STEM, FORMAT)
-    source, target = (load_surface(place / end, trust) for end in ("source", "target"))
-    try:
-        correction = Correction.taken(tensors, len(source.surface.vertices))
-        h = placed_map(metadata["map"], tensors, trust)
-        landmarks = np.array(metadata["landmarks"], dtype=np.int64).reshape(-1, 2)
-        metrics, config = dict(metadata["metrics"]), dict(metadata["config"])
-    except DAMAGE as error:
-        raise damaged(place / STEM, error) from error
-    return SurfaceMap(source, target, h, landmarks, metrics, config, correction)
-
-
-def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
-    """Values at the cut mesh's vertices (V, ...) as values at the mesh file's (W, ...).
-
-    A seam vertex takes the value of its first copy, a merged vertex that of the vertex it was
-    merged with, and a vertex that is not on the surface that of the one with the nearest number.
-    """
-    row = surface.cut_vertex
-    present = np.flatnonzero(row >= 0)
-    nearest = present[np.searchsorted(present, np.arange(len(row))).clip(max=len(present) - 1)]
-    return values[row[nearest]]
-
-
-def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
-    """Values at the mesh file's vertices (W, ...) as values at the cut mesh's (V, ...).
-
-    Vertices that were inserted between others take the mean of their neighbours, or a label of one.
-
-    Raises:
-        NsmError: ``wrong_shape``: not a row for each vertex of the file.
-    """
-    needed = len(surface.cut_vertex)
-    if values.ndim == 0 or len(values) != needed:
-        rows = 0 if values.ndim == 0 else len(values)
-        message = f"{surface.name} has {needed} vertices, but {rows} rows were given"
-        raise NsmError(message, kind="wrong_shape", key=surface.name)
-    result = values[np.maximum(surface.source_vertex, 0)]
-    whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool
-    for vertex, around in _inserted(surface):
-        result[vertex] = result[around[0]] if whole else result[around].mean(axis=0)
-    return result
-
-
-def cut_mesh_matrix(surface: Surface) -> csr_matrix:
-    """What :func:`on_cut_mesh` does to numbers, as a matrix (V, W)."""
-    known = np.flatnonzero(surface.source_vertex >= 0)
-    rows, columns, weights = [known], [surface.source_vertex[known]], [np.ones(len(known))]
-    for vertex, around in _inserted(surface):
-        rows.append(np.full(len(around), vertex))
-        columns.append(surface.source_vertex[around])
-        weights.append(np.full(len(around), 1 / len(around)))
-    entries = (np.concatenate(rows), np.concatenate(columns))
-    shape = (len(surface.vertices), len(surface.cut_vertex))
-    return csr_matrix((np.concatenate(weights), entries), shape=shape)
-
-
-def _inserted(surface: Surface) -> Iterator[tuple[int, np.ndarray]]:
-    """Each vertex that was inserted between others, and its neighbours (N,) of the mesh file."""
-    for vertex in np.flatnonzero(surface.source_vertex < 0).tolist():
-        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
-        yield vertex, around[surface.source_vertex[around] >= 0]
 
 
 def _located(surface: Surface, points: np.ndarray, what: str) -> Places:

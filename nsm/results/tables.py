@@ -9,6 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from nsm.domains.orbifold.alignment import Alignment
+from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
+from nsm.results.pair_metrics import START
 
 _ROWS = {
     "rms_percent": ("RMS distance", "% of diagonal"),
@@ -30,23 +32,32 @@ def metrics_table(metrics: Mapping[str, float]) -> Table:
 
 
 _MAP_COLUMNS = {
-    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
+    "symmetric_dirichlet_median": "D_iso, median",
     "symmetric_dirichlet_p95": "95th percentile",
+    "conformal_median": "D_conf, median",
     "singular_value_ratio_median": "σ₁/σ₂, median",
     "area_median": "area, median",
-    "flipped_percent": "flipped %",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "after",
     "boundary_self_intersections": "overlaps",
 }
+# what a method of :class:`nsm.results.Parameterization` is called in the table
+_METHODS = {"domain": "before: domain Ω"}
 
 
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
-    """The figures of :func:`nsm.results.planar_metrics`, a row for each map."""
+    """The figures of :func:`nsm.results.planar_metrics`, a row for each map.
+
+    D_iso is symmetric Dirichlet (METHOD, Eq. 2), D_conf the conformal energy (Eq. 3).
+    """
     table = Table("map", padding=(0, 1, 0, 0))  # headings fit a terminal of 80 columns
     table.columns[0].no_wrap = True
     for heading in _MAP_COLUMNS.values():
         table.add_column(heading, width=max(map(len, heading.split())))
     for name, figures in metrics.items():
-        table.add_row(name, *(f"{figures[key]:.3f}" for key in _MAP_COLUMNS))
+        shown = (_shown(figures, key, "")[0] for key in _MAP_COLUMNS)
+        table.add_row(_METHODS.get(name, name), *shown)
+    table.caption = f"D_iso is {LEAST_SYMMETRIC_DIRICHLET} at best, D_conf 0, σ₁/σ₂ 1"
     return table
 
 
@@ -54,10 +65,14 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
 _TORN = 1.0
 
 _PAIR_ROWS = {
-    "symmetric_dirichlet_median": ("symmetric Dirichlet, median", "4 at best"),
+    "symmetric_dirichlet_median": (
+        "symmetric Dirichlet, median",
+        f"{LEAST_SYMMETRIC_DIRICHLET} at best",
+    ),
     "symmetric_dirichlet_mean": ("symmetric Dirichlet, mean", ""),
     "symmetric_dirichlet_p95": ("symmetric Dirichlet, 95th percentile", ""),
     "singular_value_ratio_median": ("σ₁/σ₂, median", "1 at best"),
+    "flipped_before_repair_percent": ("flipped triangles, before repair", "%"),
     "flipped_percent": ("flipped triangles", "%"),
     "outside_percent": ("vertices outside Ω", "%"),
     "landmark_error_mean_percent": ("landmark error, mean", "% of diagonal"),
@@ -71,7 +86,8 @@ _PAIR_ROWS = {
 
 
 def pair_table(metrics: Mapping[str, float]) -> Table:
-    """The main figures of :func:`nsm.results.pair_metrics` with their names and units."""
+    """The main figures of :func:`nsm.results.pair_metrics` with their names and units, beside those
+    of the map before its optimization, if there are any."""
     return _figures(metrics, _PAIR_ROWS, missing=("landmark_error_max_percent",))
 
 
@@ -104,9 +120,11 @@ def isotopy_table(found: Sequence[Alignment]) -> Table:
 
 
 _COLLECTION_COLUMNS = {
-    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
+    "start_symmetric_dirichlet_median": "symmetric Dirichlet, median before",
+    "symmetric_dirichlet_median": "after optimization",
     "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_percent": "flipped %",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "after",
     "outside_percent": "outside %",
     "landmark_error_max_percent": "landmark error, largest %",
     "seam_gap_mean_percent": "seam gap, mean %",
@@ -130,7 +148,13 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
 # figure -> label, unit, of all tasks
 FIGURES: dict[str, tuple[str, str]] = {
     **_PAIR_ROWS,
+    **{
+        f"start_{key}": (f"before optimization: {label}", unit)
+        for key, (label, unit) in _PAIR_ROWS.items()
+        if key in START
+    },
     **_ROWS,
+    "conformal_median": ("D_conf, median", "0 at best"),
     "area_median": ("area, median", "0 at best"),
     "boundary_self_intersections": ("overlaps of the boundary", ""),
     "cycle_error_mean_percent": ("cycle error, mean", "% of diagonal"),
@@ -147,11 +171,15 @@ def _figures(
     missing: Sequence[str] = (),
 ) -> Table:
     """The rows that there are figures for; of the ``missing`` ones, a dash instead."""
-    table = Table("figure", "value", "unit")
-    table.columns[1].justify = "right"
+    before = any(f"start_{key}" in metrics for key in rows)
+    table = Table("figure", *(["at the start"] if before else []), "value", "unit")
+    for column in table.columns[1:-1]:
+        column.justify = "right"
     for key, (label, unit) in rows.items():
         if key in metrics or key in missing:  # a closed domain has no seam to report
-            table.add_row(label, *_shown(metrics, key, unit))
+            start = metrics.get(f"start_{key}")
+            first = ["" if start is None else f"{start:.3f}"] if before else []
+            table.add_row(label, *first, *_shown(metrics, key, unit))
     return table
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from tensor_checks import check_correspondences, check_tensors, check_weights
 
 import nsm
 from nsm.config import compose_config
@@ -24,6 +25,13 @@ from nsm.surfaces.textures import read_texture
 
 QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
 MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'
+PENALTY = [
+    "constraints.boundary=penalty",
+    "constraints.landmarks=fixed",
+    "constraints.ramp=0",
+    "loss_weights.seam=0",
+    "loss_weights.triangles=0",
+]
 SEAM = "seam.path=shortest"
 POINTS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0.0]])
 
@@ -150,7 +158,16 @@ def test_points_go_to_the_target_in_its_own_units(made, files):
 def test_points_may_be_tensors_that_a_gradient_is_wanted_of(made):
     _, f = made
     points = torch.tensor(f.source.in_original_units(f.source.surface.vertices[:5]))
-    assert np.array_equal(f(points.requires_grad_()), f(points.detach().numpy()))
+    image = f(points.requires_grad_())
+    assert image.requires_grad
+    assert np.allclose(image.detach().numpy(), f(points.detach().numpy()), rtol=0, atol=1e-9)
+
+
+def test_maps_of_cut_surfaces_take_tensors_and_correspond(made):
+    _, f = made
+    check_tensors(f)
+    check_weights(f)
+    check_correspondences(f)
 
 
 def test_results_are_shown_in_a_line(made, trio):
@@ -215,14 +232,30 @@ def test_figures_agree_with_an_independent_count(made):
     a, b, c = (np.c_[f.image_uv, np.zeros(len(s.uv))][s.faces[:, k]] for k in range(3))
     flipped = (np.cross(b - a, c - a)[:, 2] <= 0).mean()
     assert f.metrics["flipped_percent"] == 100 * flipped
-    # symmetric Dirichlet by singular values of each triangle's affine map
+    median = np.median(distortions(s, f.image))
+    assert f.metrics["symmetric_dirichlet_median"] == pytest.approx(median, rel=1e-6)
+
+
+def distortions(s, image):
+    """Symmetric Dirichlet by singular values of each triangle's affine map."""
     values = []
-    for x, y in zip(s.vertices[s.faces], f.image[s.faces], strict=True):
+    for x, y in zip(s.vertices[s.faces], image[s.faces], strict=True):
         e, g = np.stack([x[1] - x[0], x[2] - x[0]], 1), np.stack([y[1] - y[0], y[2] - y[0]], 1)
         q, r = np.linalg.qr(e)
         sigma = np.linalg.svd(g @ np.linalg.inv(r), compute_uv=False)
         values.append((sigma**2).sum() + (1 / (sigma**2 + 0.01)).sum())
-    assert f.metrics["symmetric_dirichlet_median"] == pytest.approx(np.median(values), rel=1e-6)
+    return values
+
+
+def test_a_map_is_compared_with_its_start(made):
+    _, f = made
+    s, t = f.source.surface, f.target.surface
+    image = t.at(s.uv @ f.map.rotation.double().numpy().T)
+    found = f.metrics["start_symmetric_dirichlet_median"]
+    assert found == pytest.approx(np.median(distortions(s, image)), rel=1e-6)
+    assert found > f.metrics["symmetric_dirichlet_median"]
+    assert f.metrics["start_flipped_percent"] == 0  # a rotation of Ω
+    assert f.metrics["start_landmark_error_max_percent"] > 1
 
 
 def test_neural_surfaces_that_are_ready_are_mapped_as_they_are(made):
@@ -272,7 +305,7 @@ def on_the_square():
     return nsm.map_pair(
         "saddle",
         "plane",
-        overrides=[*QUICK, MADE, "domain=square", "constraints=paper_pair", "trainer.max_steps=60"],
+        overrides=[*QUICK, MADE, "domain=square", *PENALTY, "trainer.max_steps=60"],
         progress=False,
     )
 
@@ -331,6 +364,13 @@ def test_a_collection_maps_every_surface_to_every_other(trio):
     for figures in trio.metrics["pairs"].values():
         assert figures["flipped_percent"] == 0
         assert figures["symmetric_dirichlet_median"] < 6
+        assert figures["start_flipped_percent"] == 0
+    for (i, j), name in trio.pair_names.items():
+        s, t = trio.surfaces[i].surface, trio.surfaces[j].surface
+        first, then = (trio.maps[k].rotation.double().numpy() for k in (i, j))
+        median = np.median(distortions(s, t.at(s.uv @ first @ then.T)))
+        found = trio.metrics["pairs"][name]["start_symmetric_dirichlet_median"]
+        assert found == pytest.approx(median, rel=1e-5)
     assert trio.metrics["cycle_error_networks_mean_percent"] < 0.01
     assert trio.metrics["cycle_error_mean_percent"] < 0.2
 

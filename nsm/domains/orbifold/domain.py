@@ -277,10 +277,10 @@ class Orbifold(ClosedDomain):
         return embed_orbifold(vertices, faces, keys)
 
     def equivariant(self, network: nn.Module) -> nn.Module:
-        """h(x) = x + ½(n(x) - n(-x)) around a periodic network n."""
-        from nsm.maps import EquivariantMap
+        """h(x) = x + ½(n(x) - n(-x)) around a periodic network n; x + n(x) if n is odd."""
+        from nsm.maps import EquivariantMap, TorusMap
 
-        return EquivariantMap(network)
+        return TorusMap(network) if getattr(network, "odd", False) else EquivariantMap(network)
 
 
 @dataclass(frozen=True)
