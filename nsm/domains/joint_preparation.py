@@ -288,6 +288,10 @@ class Matched:
     numbers: np.ndarray
     on_boundary: int
 
+    def shared(self, i: int, j: int) -> np.ndarray:
+        """Mask (K,) of the landmarks that two surfaces have."""
+        return np.asarray(np.isfinite(self.points[i] + self.points[j]).all(axis=1))
+
     def seam(self, domain: BoundedDomain, count: int) -> np.ndarray:
         """(T, 2, 2) pairs of points of ∂Ω that are one point of each surface with this seam.
 

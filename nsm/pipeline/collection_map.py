@@ -213,8 +213,10 @@ class CollectionMapTask(Task):
                 before = flipped_percent(self.trained.pair(i, j).image_uv, source.faces)
                 figures["flipped_before_repair_percent"] = before
             ends = self.starts[j], self.starts[i]
-            first, places = (carried(x, *ends) for x in (source.uv, self.matched.points[i]))
-            figures |= start_figures(source, target, first, places, self.matched.points[j])
+            both = self.matched.shared(i, j)
+            begin, end = (self.matched.points[k][both] for k in (i, j))
+            first, places = (carried(x, *ends) for x in (source.uv, begin))
+            figures |= start_figures(source, target, first, places, end)
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
         every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
