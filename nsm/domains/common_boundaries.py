@@ -149,12 +149,12 @@ def best_common_boundaries(
             key="landmarks",
         )
     cut, ends = min(tried)[2]
-    sizes = [", ".join(str(len(loop)) for loop in shape.loops) for shape in shapes]
+    first, *sizes = [", ".join(str(len(loop)) for loop in s.loops) for s in shapes]
     lines = [
-        f"boundaries of {own} edges correspond to those of {sizes[0]} edges of {names[0]}"
+        f"boundaries of {own} edges correspond to those of {first} edges of {names[0]}"
         for own in sizes
     ]
-    return cut, ends, lines
+    return cut, ends, [f"boundaries of {first} edges", *lines]
 
 
 def _matched_loops(

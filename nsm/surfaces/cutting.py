@@ -176,7 +176,7 @@ def cut_along_paths(
     steps = [np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1) for path in paths]
     low, high = np.concatenate(steps).astype(np.int64).T
     seam = np.searchsorted(keys, low * len(vertices) + high).tolist()
-    log = [f"cut along {len(seam)} edges between {len(paths) + 1} landmarks"]
+    log = [f"cut along {len(seam)} edges in {len(paths)} paths"]
     return cut_open(vertices, faces, seam, log, name)
 
 

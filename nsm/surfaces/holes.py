@@ -47,7 +47,8 @@ def fill(
         return vertices, faces, []
     sizes = ", ".join(str(len(loop)) for loop in holes[:8]) + (", ..." if len(holes) > 8 else "")
     kept = ", ".join(str(len(loop)) for loop in left[:8])
-    line = f"{len(holes)} holes of {sizes} edges filled for the map, left out of exported meshes"
+    what = f"{len(holes)} hole{'s' if len(holes) > 1 else ''} of {sizes} edges"
+    line = f"{what} filled for the map, left out of exported meshes"
     line += f"; open boundaries of {kept} edges stay" if left else ""
     return *fans(vertices, faces, holes), [line]
 
