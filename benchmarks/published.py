@@ -55,9 +55,9 @@ FORMS = {
     "full": Form("published recipe"),
     "reduced": Form(
         "published recipe, reduced: φ and ψ of 4 blocks of 32 for 7,000 steps, h of 4 layers of "
-        "128 for 7,000 steps",
+        "128 for 3,000 steps",
         ("map.width=32", "map.depth=4", "trainer.max_steps=7000"),
-        ("trainer.max_steps=7000",),
+        ("trainer.max_steps=3000",),
     ),
 }
 QUIET = ["logger=none", "artefacts=false", "trainer.progress=false", "domain=disc"]

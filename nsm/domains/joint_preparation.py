@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +21,11 @@ from nsm.domains.names import stored as stored_domain
 from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
-from nsm.stages import counted
+from nsm.side_by_side import at_once, side_by_side
+from nsm.stages import at, counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
+from nsm.surfaces.cutting import Cut
 from nsm.surfaces.landmarks import MISSING
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
@@ -46,6 +50,7 @@ def prepare_jointly(
     seam_landmarks: int | None = None,
     cache: bool = True,
     repairs: Repairs = NO_DECISION,
+    processes: int | None = 1,
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
@@ -64,6 +69,8 @@ def prepare_jointly(
             ``own``: each mesh is cut by itself.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
             all of them, or, with ``auto``, the number for which the domains agree best.
+        processes: how many meshes are laid out at once, as for
+            :func:`nsm.side_by_side.side_by_side`.
 
     Raises:
         NsmError: a mesh that cannot be prepared; ``wrong_topology`` if genus or number of boundary
@@ -92,8 +99,9 @@ def prepare_jointly(
         and needs_common_boundaries(cleaned, common_ids[0])
     )
     if apart or not several and (common != (0, 0) or not enough):
-        return [
-            Surface.from_arrays(
+
+        def alone(m: Mesh) -> Surface:
+            return Surface.from_arrays(
                 m.vertices,
                 m.faces,
                 name=m.name,
@@ -103,8 +111,8 @@ def prepare_jointly(
                 log=m.log,
                 repairs=repairs,
             )
-            for m in counted("layout on the domain", meshes)
-        ]
+
+        return _laid_out(alone, list(zip(meshes)), processes)
     digest = hashlib.sha256()
     for c, ids in zip(cleaned, found, strict=True):
         for array in (c.vertices, c.faces, ids):
@@ -128,19 +136,11 @@ def prepare_jointly(
             ]
     if domain.has_boundary:
         number = int(digest.hexdigest()[:15], 16)
-        surfaces = _cut_and_embed(
-            meshes,
-            cleaned,
-            found,
-            everywhere,
-            domain,
-            parameterization,
-            seam,
-            seam_landmarks,
-            number,
-        )
+        how = (domain, parameterization, seam, seam_landmarks)
+        one, parts = _cut_alike(meshes, cleaned, found, everywhere, *how, number)
     else:
-        surfaces = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization)
+        one, parts = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization)
+    surfaces = _laid_out(one, parts, processes)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
@@ -150,20 +150,32 @@ def prepare_jointly(
     ]
 
 
+def _laid_out(
+    one: Callable[..., Surface], parts: Sequence[tuple[Any, ...]], processes: int | None
+) -> list[Surface]:
+    """The surfaces of meshes, each laid out by a call with its part, several at once."""
+    if at_once(len(parts), processes) < 2:
+        return [one(*part) for part in counted("layout on the domain", parts)]
+    at("layout on the domain")
+    return side_by_side([partial(one, *part) for part in parts], processes)
+
+
 def _with_common_cones(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
     domain: Domain,
     method: str,
-) -> list[Surface]:
+) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
+    """What lays out a mesh, and its arguments for each."""
     numbers, score = choose_common_cones([(c.vertices, c.faces) for c in cleaned], landmarks)
     line = (
         f"cones at landmarks {numbers.tolist()}, counted from 0, the same on all meshes: mean log "
         f"distortion {score:.3f}"
     )
-    return [
-        Surface.from_closed(
+
+    def one(m: Mesh, c: CleanMesh, ids: np.ndarray) -> Surface:
+        return Surface.from_closed(
             c,
             name=m.name,
             domain=domain,
@@ -171,8 +183,8 @@ def _with_common_cones(
             cones=ids[numbers].tolist(),
             log=(*m.log, *c.log, line),
         )
-        for m, c, ids in zip(meshes, cleaned, landmarks, strict=True)
-    ]
+
+    return one, list(zip(meshes, cleaned, landmarks, strict=True))
 
 
 def check_common_topology(
@@ -208,7 +220,7 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
     return kept
 
 
-def _cut_and_embed(
+def _cut_alike(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
@@ -218,8 +230,9 @@ def _cut_and_embed(
     seam: str,
     seam_landmarks: int | None,
     number: int,
-) -> list[Surface]:
-    """The meshes cut through landmarks that all have, mask (L,), and past all others."""
+) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
+    """As :func:`_with_common_cones`, for a domain with boundary: the meshes are cut through
+    landmarks that all have, mask (L,), and past all others."""
     names = [m.name for m in meshes]
     common = [ids[everywhere] for ids in landmarks]
     others = [ids[~everywhere & (ids >= 0)] for ids in landmarks]
@@ -238,24 +251,27 @@ def _cut_and_embed(
         f"seam led along {best.seam} paths through {best.count} of {len(common[0])} landmarks, "
         "the same on all meshes"
     )
-    return [
-        replace(
-            Surface.from_cut(
-                cut,
-                c,
-                name=m.name,
-                domain=domain,
-                parameterization=method,
-                keys=Keys(key, fractions),
-                log=(*m.log, *c.log, *more, line),
-            ),
-            ends=end,
+
+    def one(
+        m: Mesh,
+        c: CleanMesh,
+        cut: Cut,
+        key: np.ndarray,
+        end: np.ndarray | None,
+        more: tuple[str, ...],
+    ) -> Surface:
+        surface = Surface.from_cut(
+            cut,
+            c,
+            name=m.name,
+            domain=domain,
+            parameterization=method,
+            keys=Keys(key, fractions),
+            log=(*m.log, *c.log, *more, line),
         )
-        for m, c, cut, key, end, more in counted(
-            "layout on the domain",
-            list(zip(meshes, cleaned, best.cuts, best.keys, ends, said, strict=True)),
-        )
-    ]
+        return replace(surface, ends=end)
+
+    return one, list(zip(meshes, cleaned, best.cuts, best.keys, ends, said, strict=True))
 
 
 def with_ends(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray]) -> list[np.ndarray]:

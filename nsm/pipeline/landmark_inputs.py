@@ -23,6 +23,7 @@ from nsm.surfaces.landmarks import (
     as_vertices,
     check_equal_lengths,
     listed,
+    present,
 )
 
 _MOVED = 1e-4  # percent of the diagonal: less is the rounding of a file's digits
@@ -34,6 +35,7 @@ def landmark_vertices(
     console: Console | None = None,
     *,
     template: bool = False,
+    told: bool = False,
 ) -> list[np.ndarray]:
     """Landmarks as vertices (L,) of each shape's mesh file.
 
@@ -49,18 +51,16 @@ def landmark_vertices(
         console: where to say how far landmarks are moved, and which are left out.
         template: whether the first shape's landmarks are the list, so that names it lacks are left
             out.
+        told: whether it is said already which are left out.
 
     Raises:
         NsmError: a file that cannot be read, a landmark that is not on its shape, or given twice,
             lists of different lengths, or a shape that has no landmark in common with another.
     """
-    console = console or Console(quiet=True)
+    silent = Console(quiet=True)
+    console = console or silent
     names = [name_of(shape) for shape in shapes]
-    found_lists, labels = _lists(given, names)
-    lists = [
-        listed(item, f"landmarks of {name}") for item, name in zip(found_lists, names, strict=True)
-    ]
-    check_equal_lengths(names, lists)
+    lists = landmark_lists(given, names, silent if told else console, template=template)
     result = []
     for list_, shape, name in zip(lists, shapes, names, strict=True):
         found, diagonal = _vertices(list_, shape)
@@ -74,22 +74,23 @@ def landmark_vertices(
                 highlight=False,
                 soft_wrap=True,
             )
-    return _in_common(result, names, labels, console, template)
+    return result
 
 
-def _in_common(
-    ids: Sequence[np.ndarray],
-    names: Sequence[str],
-    labels: Sequence[str] | None,
-    console: Console,
-    template: bool,
-) -> list[np.ndarray]:
-    """The landmarks (L,) of each shape, without those of one shape alone, which are told.
+def landmark_lists(
+    given: Any, names: Sequence[str], console: Console, *, template: bool = False
+) -> list[Landmarks]:
+    """Landmarks as :func:`landmark_vertices` takes them, for each of the surfaces with these names.
+
+    Each has two surfaces at least; others are left out and told.
 
     Raises:
-        NsmError: ``different_names``: a shape that shares none with the others.
+        NsmError: as :func:`landmark_vertices`.
     """
-    there = np.stack(ids) != MISSING
+    found, labels = _lists(given, names)
+    lists = [listed(item, f"landmarks of {name}") for item, name in zip(found, names, strict=True)]
+    check_equal_lengths(names, lists)
+    there = np.stack([present(own) for own in lists])
     shared = there.sum(axis=0) > 1
     if template:
         shared &= there[0]
@@ -115,7 +116,8 @@ def _in_common(
             lines.append(f"landmarks that {name} lacks: {said(shared & ~own)}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    return [own[shared] for own in ids]
+    kept = np.flatnonzero(shared).tolist()
+    return [own[kept] if isinstance(own, np.ndarray) else [own[k] for k in kept] for own in lists]
 
 
 def _lists(given: Any, surfaces: Sequence[str]) -> tuple[list[Any], list[str] | None]:

@@ -25,6 +25,8 @@ from nsm.results import (
     planar_metrics,
 )
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
+from nsm.results.metrics import evaluate
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
@@ -113,9 +115,13 @@ class ParamTask(Task):
             )
 
     def picture(self, module: Any) -> np.ndarray:
-        uv = module(torch.as_tensor(self.surface.uv, dtype=torch.float32, device=module.device))
-        image = layout_image(self.surface, uv.detach().cpu().double().numpy())
+        image = layout_image(self.surface, evaluate(module, self.surface.uv))
         return np.round(255 * image).astype(np.uint8)
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        uv = evaluate(module, self.surface.uv)
+        flat = np.column_stack([uv, np.zeros(len(uv))])
+        return painted(flat, self.surface.faces, self.surface.vertices)
 
     def write_artefacts(
         self, folder: Path, result: Parameterization | ParameterizationAtlas
@@ -130,7 +136,8 @@ class ParamTask(Task):
             export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
         faces = surface.faces[~surface.filled]
         write_patterns(folder / "pattern", result.uv / surface.scale, faces)
-        before_after = {"before: domain Ω": surface.uv, "after": result.uv}
+        energy = str(self.config.energy["_target_"]).rpartition(".")[2]
+        before_after = {"before: domain Ω": surface.uv, f"after: {energy}": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
 

@@ -173,6 +173,7 @@ def neural_surfaces(
                 seam_landmarks=config.seam.landmarks,
                 cache=config.surface.cache,
                 repairs=configured_repairs(config),
+                processes=config.phi.get("processes"),
             )
         known = [phi.surface for phi in ready.values() if not isinstance(phi.map, AnalyticSurface)]
         _refuse([*prepared, *known])

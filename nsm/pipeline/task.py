@@ -21,6 +21,7 @@ from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
 from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
+from nsm.results.meshes import ColouredMesh
 from nsm.tasks.training import Training
 
 
@@ -211,8 +212,9 @@ class Task:
         raise NotImplementedError
 
     def inner_line(self, result: Any) -> str:
-        """What is printed of a run that is part of another, after the surface's name."""
-        return f"neural surface, RMS distance {result.metrics['rms_percent']:.3f} % of the diagonal"
+        """What is printed of a part of a task, after the surface's name; "" for a neural surface,
+        whose line the runner has."""
+        return ""
 
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""
@@ -231,6 +233,10 @@ class Task:
 
     def picture(self, module: Any) -> np.ndarray | None:
         """A picture (H, W, 3) uint8 of the module as it stands, for the log; None: none."""
+        return None
+
+    def mesh(self, module: Any) -> ColouredMesh | None:
+        """The same as a mesh; None: none."""
         return None
 
     def save(self, folder: Path, result: Any) -> None:

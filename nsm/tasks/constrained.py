@@ -78,13 +78,11 @@ class ConstrainedMap(Training):
         """Register landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point.
 
-        A target is NaN where a surface lacks the landmark. On a closed domain, the targets' lifts
-        nearest to the start are wanted.
+        A target is NaN where a surface lacks the landmark. On a closed domain, the targets are the
+        lifts that h should meet.
         """
         there = torch.isfinite(targets).all(dim=-1)
         targets = torch.where(there[..., None], targets, start)
-        lifted = self.domain.lift(targets.flatten(0, -2), start.flatten(0, -2))
-        targets = lifted.view_as(targets)
         given = {"points": points, "targets": targets, "start": start, "seam": seam, "there": there}
         if not self.exact:
             given["boundary_samples"] = self.domain.boundary_samples()
