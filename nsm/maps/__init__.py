@@ -4,7 +4,7 @@ from nsm.maps.activations import Activation, as_activation
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Formula, build_analytic
 from nsm.maps.analytic_closed import ClosedAnalyticSurface
 from nsm.maps.batched_maps import batched
-from nsm.maps.composition import Composition, LatticeAligned, PointMap, Rotated
+from nsm.maps.composition import Composition, LatticeAligned, Placed, PointMap, Rotated
 from nsm.maps.encodings import Encoding, Identity, RandomFourierFeatures, SplineGrid
 from nsm.maps.equivariant import EquivariantMap, TorusMap
 from nsm.maps.inverse import TransitionMap, inverted
@@ -32,6 +32,7 @@ __all__ = [
     "LatticeSplineGrid",
     "MultilevelSpline",
     "NeuralMap",
+    "Placed",
     "PlanarMap",
     "PlanarNetwork",
     "PointMap",

@@ -17,8 +17,8 @@ from nsm.domains.orbifold.collection_alignment import alignments_to_first, disag
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -34,10 +34,20 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_tears,
+    write_correspondences,
 )
+from nsm.results.collection_pictures import cycle_picture
+from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import start_figures
 from nsm.tasks import CollectionMap
-from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import (
+    aligned,
+    carried,
+    landmark_rotation,
+    least_distorting_rotation,
+)
 
 _SEAM_POINTS = 24  # on each branch
 _RINGS = 80  # of an even mesh of the common domain
@@ -56,6 +66,7 @@ class CollectionMapTask(Task):
     closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
+    proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -75,7 +86,9 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console
+        )
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
@@ -132,15 +145,24 @@ class CollectionMapTask(Task):
         return f"{self.name} of {len(self.phis)} surfaces"
 
     def build(self) -> Any:
+        points, targets = self.points, self.targets
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
+            # as for pairs: the corners are key points (METHOD)
+            corners = torch.from_numpy(self.domain.corners).to(points)
+            points = torch.cat([points, corners])
+            kept = torch.stack([start.before(corners) for start in self.starts])
+            targets = torch.cat([targets, kept], dim=1)
+        names = [phi.surface.name for phi in self.phis]
         return self.module(
             **self.map_settings(),
-            points=self.points,
-            targets=self.targets,
+            points=points,
+            targets=targets,
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
             starts=self.starts,
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[phi.map for phi in self.phis],
+            names=names if len(set(names)) == len(names) else None,
         )
 
     def _mesh(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -187,6 +209,15 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+        for (i, j), name in result.pair_names.items():
+            figures = result.metrics["pairs"][name]
+            source, target = self.phis[i].surface, self.phis[j].surface
+            if self.trained is not None:
+                before = flipped_percent(self.trained.pair(i, j).image_uv, source.faces)
+                figures["flipped_before_repair_percent"] = before
+            ends = self.starts[j], self.starts[i]
+            first, places = (carried(x, *ends) for x in (source.uv, self.matched.points[i]))
+            figures |= start_figures(source, target, first, places, self.matched.points[j])
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
         every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
@@ -197,14 +228,27 @@ class CollectionMapTask(Task):
         return {"surfaces": names, "landmarks": len(self.ids[0])}
 
     def picture(self, module: Any) -> np.ndarray:
-        # where the vertices of the first go if h_0 is taken for its start
+        return map_image(self.surface, self.phis[-1].surface, self._in_the_last(module))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.phis[-1].surface.at(self._in_the_last(module))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
+    def _in_the_last(self, module: Any) -> np.ndarray:
+        """Where the vertices of the first surface go in the last one's domain (V, 2), if h_0 is
+        taken for its start."""
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
-        uv = evaluate(module.map[-1], start.numpy())
-        return map_image(self.surface, self.phis[-1].surface, uv)
+        return evaluate(module.map[-1], start.numpy())
+
+    def save(self, folder: Path, result: SurfaceCollection) -> None:
+        super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)
         transfer_matrix_picture(folder / "transfer.png", result)
+        cycle_picture(folder / "cycle.png", result)
         for i, source in enumerate(result.surfaces):
             for j, target in enumerate(result.surfaces):
                 if i != j:
@@ -216,6 +260,7 @@ class CollectionMapTask(Task):
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.welded_image)
         np.save(folder / "mapped_vertices.npy", image)
+        write_correspondences(folder / "correspondences.npz", f)
         vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
         export_surface(file, vertices, target.surface, f.source_uv)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import LatticeAligned, Rotated, batched
+from nsm.settings import CollectionConstraints
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
@@ -29,7 +30,8 @@ class CollectionMap(ConstrainedMap):
     i. The loss is METHOD's sum over all ordered pairs, divided by k(k − 1): each surface takes
     part in 2(k − 1) pairs, so its energy and its constraints have the same proportion for all k,
     and the loss does not grow with k. Four is the number of surfaces for which the default weights
-    were measured. Multipliers are scaled like the term C.
+    were measured. Multipliers are scaled like the term C. With ``constraints.pairs=sum`` the loss
+    is METHOD's: the sum over all ordered pairs, and Σ_i of the other terms without the 4/k.
 
     Args:
         map, activation, encoding: settings of each h_i's network.
@@ -44,10 +46,14 @@ class CollectionMap(ConstrainedMap):
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
+        names: of the surfaces, each its own, for the curves ``pairs/A_to_B``; None: their numbers.
 
     Raises:
         ValueError: a constraint that is not known.
     """
+
+    Constraints = CollectionConstraints
+    constraints: CollectionConstraints
 
     def __init__(
         self,
@@ -69,9 +75,10 @@ class CollectionMap(ConstrainedMap):
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh"]
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh", "names"]
         self.save_hyperparameters(ignore=given, logger=False)
         onto = domain if self.exact else None
         self.map = nn.ModuleList(
@@ -87,6 +94,9 @@ class CollectionMap(ConstrainedMap):
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
+        names = names or [str(k) for k in range(len(phis))]
+        both = zip(*(part.tolist() for part in self.ordered), strict=True)
+        self.pair_names = [f"pairs/{names[a]}_to_{names[b]}" for a, b in both]
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (N, 2) of the common domain to those of all surfaces, (k, N, 2)."""
@@ -94,7 +104,9 @@ class CollectionMap(ConstrainedMap):
         return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
-        w, ramp, scale = self.loss_weights, self.ramp, _SURFACES / len(self.map)
+        w, ramp, k = self.loss_weights, self.ramp, len(self.map)
+        summed = self.constraints.pairs == "sum"
+        pairs, scale = (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
@@ -104,7 +116,7 @@ class CollectionMap(ConstrainedMap):
         U = self._triangle_term() if w.triangles > 0 else 0.0
         C, multipliers = self.landmark_terms()
 
-        loss = energy + scale * (
+        loss = pairs * energy + scale * (
             multipliers
             + w.injectivity * G
             + w.boundary * B
@@ -113,7 +125,7 @@ class CollectionMap(ConstrainedMap):
             + w.landmarks * C
         )
         terms: dict[str, Term] = {
-            **distortion.terms,
+            **{name: (pairs * weight, E) for name, (weight, E) in distortion.terms.items()},
             "multipliers": (scale, multipliers),
             "injectivity": (scale * w.injectivity, G),
             "boundary": (scale * w.boundary, B),
@@ -171,7 +183,10 @@ class CollectionMap(ConstrainedMap):
         return torch.stack([barrier(h, self.global_step) for h, barrier in both]).sum()
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
-        self.log_validation(*self._evaluated(batch))
+        distortion, evaluation = self._evaluated(batch)
+        self.log_validation(distortion, evaluation)
+        of_pairs = dict(zip(self.pair_names, distortion.means.unbind(), strict=True))
+        self.log_figures(of_pairs, batch_size=len(batch))
 
     def flipped_percent(self) -> Tensor:
         both = zip(self.map, self.fold_barrier, strict=True)

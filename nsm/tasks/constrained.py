@@ -65,7 +65,7 @@ class ConstrainedMap(Training):
         super().__init__()
         self.domain, self.energy = domain, as_blend(energy)
         self.loss_weights = PairWeights(**loss_weights)
-        self.constraints = PairConstraints(**constraints)
+        self.constraints = self.Constraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
