@@ -248,7 +248,7 @@ def tables() -> str:
         parts.append(table(["what", *BY_ENERGY.values(), "seconds"], energies))
     others = baselines(sorted(RESULTS.parent.glob("published-*.json")))
     if others:
-        parts.append("384 → 388 by other means:")
+        parts.append("Maps by other means; composed parameterizations are not optimized:")
         parts.append(table(["map", *BASELINES.values(), "seconds"], others))
     parts.append("Flattening, beside libigl's methods on the same cut mesh:")
     parts.append(table(["surface", "method", *FLAT.values()], flat))
@@ -266,8 +266,7 @@ BASELINES = {
 
 
 def baselines(files: list[Path]) -> list[list[str]]:
-    """Maps of one pair by other means, beside the default's result, as benchmarks/published.py
-    measured them.
+    """Maps of each pair that benchmarks/published.py measured, by the default and by other means.
 
     A map that is not repaired has one share of flips. The published recipe cuts each shape by
     itself, the default both together.
@@ -281,17 +280,17 @@ def baselines(files: list[Path]) -> list[list[str]]:
                 continue
             if stage == "default":
                 spent = f"{entry['seconds']:.0f}"
-                rows.append(["nsm, default", *_values(entry["metrics"], BASELINES), spent])
+                rows.append([f"{what}: nsm, default", *_values(entry["metrics"], BASELINES), spent])
                 start = _start(entry["metrics"])
-                rows.append(["its parameterizations composed, no optimization", *start, "–"])
+                rows.append([f"{what}: its parameterizations composed", *start, "–"])
                 continue
             told = {**entry["metrics"]}
             told["flipped_before_repair_percent"] = told["flipped_percent"]
             label = {
-                "before": "parameterizations of the published recipe composed, no optimization",
+                "before": "parameterizations of the published recipe composed",
                 "published": f"{found['form']}, at its stop",
             }.get(stage, f"{found['form']}, after the default's time")
-            rows.append([label, *_values(told, BASELINES), f"{entry['seconds']:.0f}"])
+            rows.append([f"{what}: {label}", *_values(told, BASELINES), f"{entry['seconds']:.0f}"])
     return rows
 
 
