@@ -223,13 +223,19 @@ class PhiSettings:
     """The neural surface that a map starts from.
 
     Args:
-        path: for task=param, the run folder of a neural surface; null: one is trained.
+        path: for task=param, the run folder of a neural surface; null: one is made.
         overrides: for maps, settings of the trainings of their neural surfaces, as in
             'phi.overrides=["map=residual","seed=1"]'.
+        steps: for maps, steps of these trainings at most, where they start from a least-squares
+            fit, which is near enough for a map; null: as many as task=overfit makes.
+        processes: for maps of several meshes, how many are prepared at once, each by a process on a
+            CPU core of its own; null: as many as there are cores.
     """
 
     path: str | None = None
     overrides: list[str] = field(default_factory=list)
+    steps: Whole | None = 0
+    processes: Count | None = None
 
 
 @dataclass
@@ -247,14 +253,17 @@ class AttributesSettings:
 
 @dataclass
 class ProposalSettings:
-    """What happens to landmarks that landmarks=auto proposes.
+    """What happens to landmarks that nsm proposes for closed meshes of genus 0.
 
     Args:
         strict: end with an error where the proposal is not sure, before any training.
         alternative: which proposal is taken: 0 the best, 1 the second best.
+        complete: one to four given landmarks are completed by proposed ones; to four, only where
+            these are sure.
     """
 
     strict: bool = False
+    complete: bool = True
     alternative: Whole = 0
 
 
@@ -295,7 +304,7 @@ class TrainerSettings:
     """Length, hardware and stopping rule of the training, and what it records.
 
     Args:
-        max_steps: steps of the optimizer.
+        max_steps: steps of the optimizer; 0: the network stays as it starts.
         accelerator: auto, cpu or gpu.
         devices: processes that share each step, each with its part of the batch on its own CPU
             core or GPU.
@@ -315,10 +324,13 @@ class TrainerSettings:
         progress: show a progress bar.
         gradient_clip: largest norm of a step's gradient; null: no limit.
         log_every: steps between two values in the logs.
-        log_pictures: pictures of the surface or map in the logs.
+        log_pictures: pictures of the surface or map in the logs, the first before the training and
+            the last at its end.
+        log_meshes: the same as meshes, which TensorBoard shows in 3D; each takes 40 bytes a vertex.
+        log_histograms: histograms of weights and gradients in TensorBoard, as evenly.
     """
 
-    max_steps: Count = 8000
+    max_steps: Whole = 8000
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: Count = 1
     stop_gradient_norm: Weight | None = None
@@ -332,6 +344,8 @@ class TrainerSettings:
     gradient_clip: Weight | None = None
     log_every: Count = 25
     log_pictures: Whole = 6
+    log_meshes: Whole = 0
+    log_histograms: Whole = 6
 
 
 @dataclass(frozen=True)
@@ -446,7 +460,8 @@ class Settings:
             .json, one for each surface, or the names of meshes of the catalogue that have some; or
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
             b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
-            task=pair_map with two closed meshes of genus 0: landmarks are proposed.
+            closed meshes of genus 0: landmarks are proposed, as they are where none are given;
+            []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the

@@ -13,12 +13,12 @@ from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
 from nsm.domains.joint_preparation import Matched, matched_landmarks
-from nsm.domains.orbifold.alignment import alignments_to_first
+from nsm.domains.orbifold.collection_alignment import alignments_to_first, disagreements
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -34,9 +34,11 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_tears,
+    write_correspondences,
 )
 from nsm.results.collection_pictures import cycle_picture
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.tasks import CollectionMap
@@ -64,6 +66,7 @@ class CollectionMapTask(Task):
     closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
+    proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -83,7 +86,9 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console
+        )
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
@@ -93,11 +98,17 @@ class CollectionMapTask(Task):
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)
-        self.targets, self.starts = targets, self._starts(targets)
+        self.starts = self._starts(targets)
         back = torch.stack([h.back(q) for h, q in zip(self.starts, targets, strict=True)])
         if not self.domain.has_boundary:
-            back = torch.stack([self.domain.lift(x, targets[0]) for x in back])
+            back = torch.stack(
+                [self.domain.lift(x, targets[0], self.surface.lattice) for x in back]
+            )
         self.points = back.mean(dim=0)
+        near = zip(self.phis, self.starts, targets, strict=True)
+        self.targets = torch.stack(
+            [self.domain.lift(q, h.before(self.points), phi.surface.lattice) for phi, h, q in near]
+        )
         on_boundary = slice(self.matched.on_boundary)
         if self.domain.has_boundary:
             self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
@@ -107,7 +118,16 @@ class CollectionMapTask(Task):
         surfaces = [phi.surface for phi in self.phis]
         if not self.domain.has_boundary:
             common = self.ids if targets.shape[1] else None
-            return [aligned(found.inverse) for found in alignments_to_first(surfaces, common)]
+            to_first = alignments_to_first(surfaces, common)
+            for pair in disagreements(surfaces, to_first, common):
+                ends = f"{surfaces[pair.source].name} → {surfaces[pair.target].name}"
+                self.console.print(
+                    f"{ends}: the isotopy class that follows from the other pairs scores "
+                    f"{pair.composed.score:.3f}, the pair's own best {pair.own.score:.3f}; if the "
+                    "map is distorted, map the pair alone or check its landmarks",
+                    soft_wrap=True,
+                )
+            return [aligned(found.inverse) for found in to_first]
         uv = torch.as_tensor(self.surface.uv, dtype=torch.float32)
         some = uv[:: len(uv) // 4096 + 1]
         first, *others = self.phis
@@ -132,6 +152,7 @@ class CollectionMapTask(Task):
             points = torch.cat([points, corners])
             kept = torch.stack([start.before(corners) for start in self.starts])
             targets = torch.cat([targets, kept], dim=1)
+        names = [phi.surface.name for phi in self.phis]
         return self.module(
             **self.map_settings(),
             points=points,
@@ -141,6 +162,7 @@ class CollectionMapTask(Task):
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[phi.map for phi in self.phis],
+            names=names if len(set(names)) == len(names) else None,
         )
 
     def _mesh(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -206,10 +228,22 @@ class CollectionMapTask(Task):
         return {"surfaces": names, "landmarks": len(self.ids[0])}
 
     def picture(self, module: Any) -> np.ndarray:
-        # where the vertices of the first go if h_0 is taken for its start
+        return map_image(self.surface, self.phis[-1].surface, self._in_the_last(module))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.phis[-1].surface.at(self._in_the_last(module))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
+    def _in_the_last(self, module: Any) -> np.ndarray:
+        """Where the vertices of the first surface go in the last one's domain (V, 2), if h_0 is
+        taken for its start."""
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
-        uv = evaluate(module.map[-1], start.numpy())
-        return map_image(self.surface, self.phis[-1].surface, uv)
+        return evaluate(module.map[-1], start.numpy())
+
+    def save(self, folder: Path, result: SurfaceCollection) -> None:
+        super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)
@@ -226,6 +260,7 @@ class CollectionMapTask(Task):
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.welded_image)
         np.save(folder / "mapped_vertices.npy", image)
+        write_correspondences(folder / "correspondences.npz", f)
         vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
         export_surface(file, vertices, target.surface, f.source_uv)

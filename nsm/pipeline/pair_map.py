@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from rich.text import Text
-from scipy.sparse import save_npz
 
 from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks
@@ -17,15 +16,8 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.proposed_landmarks import (
-    AUTO,
-    ProposedLandmarks,
-    asks_for_proposal,
-    propose_landmarks,
-)
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -37,6 +29,7 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     distortion_picture,
+    export_mesh,
     export_surface,
     isotopy_table,
     map_image,
@@ -44,10 +37,15 @@ from nsm.results import (
     morph_pictures,
     pair_metrics,
     pair_table,
+    reliability_picture,
     transfer_picture,
     warning_of_tears,
+    write_correspondences,
+    write_reliability,
 )
+from nsm.results.file_faces import faces_of_file
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.results.pair_pictures import normals_picture
@@ -91,18 +89,11 @@ class PairMapTask(Task):
         ]
         self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        self.proposed = None
-        if asks_for_proposal(landmarks, shapes, self.domain):
-            self.proposed = propose_landmarks(
-                shapes,
-                **settings["proposal"],
-                asked=landmarks == AUTO,
-                console=self.console,
-                repairs=configured_repairs(self.config),
-            )
-            landmarks = self.proposed.landmarks if self.proposed else None
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        of_files = self.textures is not None or any(settings["attributes"].values())
         counts = [vertex_count(shape) for shape in shapes]
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
+        )
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
@@ -132,6 +123,7 @@ class PairMapTask(Task):
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
         self.start = start = self._start(p, q)
+        q = self.domain.lift(q, start.before(p), target.lattice)
         phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
@@ -246,6 +238,10 @@ class PairMapTask(Task):
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
 
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.psi.surface.at(evaluate(module, self.surface.uv))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
         if self.proposed is not None:
@@ -265,16 +261,27 @@ class PairMapTask(Task):
         for name, mesh in meshes.items():
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
-        save_npz(folder / "source_to_target.npz", f.matrix())
-        (folder / "morph").mkdir(exist_ok=True)
-        for k in range(_MORPH_FRAMES):
-            frame = f.source.in_original_units(f.morph(k / (_MORPH_FRAMES - 1)))
-            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
+        write_correspondences(folder / "correspondences.npz", f)
+        write_reliability(folder / "reliability.ply", f)
+        reliability_picture(folder / "reliability.png", f)
+        _write_morph(folder, f)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         if isinstance(f.target.map, AnalyticSurface):
             normals_picture(folder / "normals.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_morph(folder: Path, f: SurfaceMap) -> None:
+    """The path from the source to its image, with the vertices and faces of the source's file."""
+    s = f.source.surface
+    faces, corners = faces_of_file(s)
+    uv = s.uv if s.domain.has_boundary else None
+    (folder / "morph").mkdir(exist_ok=True)
+    for k in range(_MORPH_FRAMES):
+        frame = f.morph(k / (_MORPH_FRAMES - 1))
+        export_mesh(folder / "morph" / f"{k:02d}.obj", frame, faces, uv, corners=corners)
+    f.export_morph(folder / "morph.glb")
 
 
 def _write_image(folder: Path, f: SurfaceMap) -> None:

@@ -22,6 +22,8 @@ from nsm.results import (
     planar_metrics,
 )
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
+from nsm.results.metrics import evaluate
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
@@ -80,9 +82,13 @@ class ParamTask(Task):
             )
 
     def picture(self, module: Any) -> np.ndarray:
-        uv = module(torch.as_tensor(self.surface.uv, dtype=torch.float32, device=module.device))
-        image = layout_image(self.surface, uv.detach().cpu().double().numpy())
+        image = layout_image(self.surface, evaluate(module, self.surface.uv))
         return np.round(255 * image).astype(np.uint8)
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        uv = evaluate(module, self.surface.uv)
+        flat = np.column_stack([uv, np.zeros(len(uv))])
+        return painted(flat, self.surface.faces, self.surface.vertices)
 
     def write_artefacts(self, folder: Path, result: Parameterization) -> None:
         surface = self.surface

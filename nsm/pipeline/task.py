@@ -21,6 +21,7 @@ from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
 from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
+from nsm.results.meshes import ColouredMesh
 from nsm.tasks.training import Training
 
 
@@ -215,6 +216,10 @@ class Task:
 
     def picture(self, module: Any) -> np.ndarray | None:
         """A picture (H, W, 3) uint8 of the module as it stands, for the log; None: none."""
+        return None
+
+    def mesh(self, module: Any) -> ColouredMesh | None:
+        """The same as a mesh; None: none."""
         return None
 
     def save(self, folder: Path, result: Any) -> None:

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 
 from nsm.domains import Surface, from_stored, stored
 from nsm.domains.surface import ARRAYS, OPTIONAL
+from nsm.energies import spectrum
+from nsm.errors import NsmError
 from nsm.maps import Placed
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
@@ -123,6 +125,32 @@ class NeuralSurface:
         if s.raw is not None:
             return s.raw
         return by_file_vertex(s, self.in_original_units(s.vertices)), s.file_faces()[0]
+
+    def spectrum(self, count: int = 10) -> tuple[np.ndarray, np.ndarray]:
+        """The smallest eigenvalues of the Laplace–Beltrami operator, and their functions.
+
+        See :func:`nsm.energies.spectrum`: functions are linear on the mesh's triangles of Ω, the
+        metric is that of φ, and a seam is joined.
+
+        Args:
+            count: how many, the constant function's λ = 0 among them.
+
+        Returns:
+            λ (count,), ascending, per square unit of the mesh file, and functions (W, count) at the
+            vertices of the mesh file.
+
+        Raises:
+            NsmError: ``out_of_range``: count is not from 1 to the number of vertices less one.
+        """
+        s = self.surface
+        vertex, inserted = s.source_vertex, s.source_vertex < 0
+        joined = np.where(inserted, len(s.cut_vertex) + np.arange(len(vertex)), vertex)
+        most = len(np.unique(joined)) - 1
+        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
+            message = f"count: {count!r} is not a whole number from 1 to {most}"
+            raise NsmError(message, kind="out_of_range", key="count")
+        values, functions = spectrum(self.module(), s.uv, s.faces, count, joined=joined)
+        return values, by_file_vertex(s, functions)
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """φ at the mesh's vertices: (V, 3) in the units of its file, faces (F, 3) and uv (V, 2).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -15,6 +15,25 @@ from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
 from nsm.results.textures import checkerboard, checkerboard_at
 from nsm.results.vertex_values import mean_by_file_vertex
+
+
+class ColouredMesh(NamedTuple):
+    """Vertices (V, 3), faces (F, 3), and colours (V, 3) uint8 of the vertices."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray
+
+
+def painted(vertices: np.ndarray, faces: np.ndarray, source: np.ndarray) -> ColouredMesh:
+    """A mesh (V, 3), (F, 3) with the colours of its vertices' places (V, 3) on the source."""
+    return ColouredMesh(vertices, faces, np.round(255 * by_position(source)).astype(np.uint8))
+
+
+def by_position(vertices: np.ndarray) -> np.ndarray:
+    """Colours (V, 3) in [0, 1] by place in the bounding box."""
+    low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    return np.asarray((vertices - low) / np.maximum(extent, 1e-12))
 
 
 def export_mesh(

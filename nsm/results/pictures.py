@@ -87,7 +87,7 @@ def by_normals(normals: np.ndarray) -> Callable[[Blend], np.ndarray]:
 
 def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
     """The neural surface with Ω's checkerboard on it, beside Ω."""
-    uv, faces = _fine(surface)
+    uv, faces = fine(surface)
     image = View(surface.vertices, PANEL).draw(
         evaluate(neural.map, uv), faces, lambda blend: checkerboard_at(blend(uv))
     )
@@ -102,7 +102,7 @@ def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurfa
 
 def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -> np.ndarray:
     """A quick picture (size, size, 3) uint8 of φ."""
-    uv, faces = _fine(surface)
+    uv, faces = fine(surface)
     picture = View(surface.vertices, size).draw(evaluate(phi, uv), faces, _grey)
     return np.round(255 * picture).astype(np.uint8)
 
@@ -111,7 +111,8 @@ def _grey(blend: Blend) -> np.ndarray:
     return GREY
 
 
-def _fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+def fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Points of Ω (N, 2) and faces (M, 3): the mesh, subdivided until it shows the shape of φ."""
     uv, faces = surface.uv, surface.faces
     while len(faces) < _FINE_FACES:
         uv, faces = subdivide(uv, faces)

@@ -1,5 +1,6 @@
 """Maps between surfaces, as users run them: from meshes, ready surfaces, in Python, resumed."""
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -101,6 +102,10 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         "morph.png",
         "morph.gif",
         "morph/08.obj",
+        "morph.glb",
+        "correspondences.npz",
+        "reliability.ply",
+        "reliability.png",
     ):
         assert (folder / name).stat().st_size > 0, name
 
@@ -222,10 +227,11 @@ def test_a_file_with_copies_of_vertices_in_other_units(made, files, tmp_path):
 
 def test_a_morph_begins_at_the_source_and_ends_at_the_image(made):
     _, f = made
-    assert (f.morph(0.0) == f.source.surface.vertices).all()
-    end, image = f.morph(1.0), f.image
+    vertices, faces = f.source.file_mesh()
+    assert (f.morph(0.0) == vertices).all()
+    end, image = f.morph(1.0), f.welded_image / f.source.surface.scale
     # a rigid motion keeps all distances
-    edges = f.source.surface.faces[:, :2]
+    edges = faces[:, :2]
     lengths = [np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (end, image)]
     assert np.abs(lengths[0] - lengths[1]).max() < 1e-9
 
@@ -370,12 +376,29 @@ def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")
-def trio():
+def folder_of_trio(tmp_path_factory):
+    return tmp_path_factory.mktemp("trio")
+
+
+@pytest.fixture(scope="module")
+def trio(folder_of_trio):
     return nsm.map_collection(
         ["hemisphere", "saddle", "cone"],
-        overrides=[*QUICK, MADE, "trainer.max_steps=150"],
+        overrides=[*QUICK, MADE, "trainer.max_steps=150", "logger=csv", "artefacts=false"],
+        folder=folder_of_trio,
         progress=False,
     )
+
+
+def test_each_pair_of_a_collection_has_a_curve(trio, folder_of_trio):
+    with (folder_of_trio / "csv" / "metrics.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["val/distortion"]]
+    assert len(rows) == 3
+    names = [f"pairs/{name.replace(' → ', '_to_')}" for name in trio.metrics["pairs"]]
+    assert sorted(names) == sorted(name for name in rows[0] if name.startswith("pairs/"))
+    for row in rows:
+        mean = np.mean([float(row[name]) for name in names])
+        assert mean == pytest.approx(float(row["val/distortion"]), rel=1e-5)
 
 
 def test_a_collection_maps_every_surface_to_every_other(trio):
