@@ -223,13 +223,19 @@ class PhiSettings:
     """The neural surface that a map starts from.
 
     Args:
-        path: for task=param, the run folder of a neural surface; null: one is trained.
+        path: for task=param, the run folder of a neural surface; null: one is made.
         overrides: for maps, settings of the trainings of their neural surfaces, as in
             'phi.overrides=["map=residual","seed=1"]'.
+        steps: for maps, steps of these trainings at most, where they start from a least-squares
+            fit, which is near enough for a map; null: as many as task=overfit makes.
+        processes: for maps of several meshes, how many are prepared at once, each by a process on a
+            CPU core of its own; null: as many as there are cores.
     """
 
     path: str | None = None
     overrides: list[str] = field(default_factory=list)
+    steps: Whole | None = 0
+    processes: Count | None = None
 
 
 @dataclass
@@ -247,14 +253,17 @@ class AttributesSettings:
 
 @dataclass
 class ProposalSettings:
-    """What happens to landmarks that landmarks=auto proposes.
+    """What happens to landmarks that nsm proposes for closed meshes of genus 0.
 
     Args:
         strict: end with an error where the proposal is not sure, before any training.
         alternative: which proposal is taken: 0 the best, 1 the second best.
+        complete: one to four given landmarks are completed by proposed ones; to four, only where
+            these are sure.
     """
 
     strict: bool = False
+    complete: bool = True
     alternative: Whole = 0
 
 
@@ -295,14 +304,14 @@ class TrainerSettings:
     """Length, hardware and stopping rule of the training, and what it records.
 
     Args:
-        max_steps: steps of the optimizer.
+        max_steps: steps of the optimizer; 0: the network stays as it starts.
         accelerator: auto, cpu or gpu.
         devices: processes that share each step, each with its part of the batch on its own CPU
             core or GPU.
         stop_gradient_norm: stop when the norm of the gradient, averaged over ``stop_window``
             steps, falls below this; null: never.
         stop_norm_of: the loss whose norm is meant: mean over the batch, as it is trained; or sum,
-            the mean's times ``data.batch_size``.
+            the mean's times the number of samples in the batch.
         stop_window: steps over which the norm is averaged.
         threads: of the CPU; the default networks are so small that one is fastest. null: what
             torch chooses, for large networks.
@@ -321,7 +330,7 @@ class TrainerSettings:
         log_histograms: histograms of weights and gradients in TensorBoard, as evenly.
     """
 
-    max_steps: Count = 8000
+    max_steps: Whole = 8000
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: Count = 1
     stop_gradient_norm: Weight | None = None
@@ -418,6 +427,26 @@ class PairConstraints(Checked):
     multipliers_from: Share = 0.0
 
 
+@dataclass(frozen=True)
+class CollectionConstraints(PairConstraints):
+    """How task=collection_map constrains its maps.
+
+    Args:
+        boundary: exact: every h_i keeps to the domain by construction; penalty: λ_B pulls the image
+            of the boundary to ∂Ω.
+        landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
+        multiplier_every: steps between two updates of the multipliers.
+        ramp: share of the steps over which the weights of landmarks and seam rise to their values.
+        fold_margin: what the determinant of J_h must stay above at the mesh triangles.
+        fold_every: steps between two looks for the mesh triangles nearest to folding.
+        multipliers_from: share of the steps before the multipliers' first update.
+        pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
+            mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.
+    """
+
+    pairs: Literal["mean", "sum"] = "mean"
+
+
 @dataclass
 class Settings:
     """The settings of a run outside the groups.
@@ -431,7 +460,8 @@ class Settings:
             .json, one for each surface, or the names of meshes of the catalogue that have some; or
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
             b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
-            task=pair_map with two closed meshes of genus 0: landmarks are proposed.
+            closed meshes of genus 0: landmarks are proposed, as they are where none are given;
+            []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the

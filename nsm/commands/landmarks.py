@@ -117,10 +117,10 @@ def _start(shapes: Sequence[EditedShape], file: Path | None, empty: bool) -> Lan
         return LandmarkList(count, ids, names)
     if empty:
         return LandmarkList(count)
-    from nsm.correspondence.proposal import proposed_for_all
+    from nsm.correspondence import proposed_for_all
 
     try:
-        found = proposed_for_all([(s.vertices, s.faces) for s in shapes])
+        found = proposed_for_all([(s.vertices, s.faces) for s in shapes]).vertices[0]
     except NsmError as error:
         print(f"begins without landmarks: {error}", flush=True)
         return LandmarkList(count)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +19,11 @@ from nsm.domains.names import stored as stored_domain
 from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
-from nsm.stages import counted
+from nsm.side_by_side import at_once, side_by_side
+from nsm.stages import at, counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
+from nsm.surfaces.cutting import Cut
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 
@@ -43,6 +47,7 @@ def prepare_jointly(
     seam_landmarks: int | None = None,
     cache: bool = True,
     repairs: Repairs = NO_DECISION,
+    processes: int | None = 1,
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
@@ -60,6 +65,8 @@ def prepare_jointly(
             ``own``: each mesh is cut by itself.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
             all of them, or, with ``auto``, the number for which the domains agree best.
+        processes: how many meshes are laid out at once, as for
+            :func:`nsm.side_by_side.side_by_side`.
 
     Raises:
         NsmError: a mesh that cannot be prepared; ``wrong_topology`` if genus or number of boundary
@@ -73,8 +80,9 @@ def prepare_jointly(
     kinds = [topology.genus_and_boundary(c.faces) for c in cleaned]
     common = check_common_topology([m.name for m in meshes], kinds)
     if common != (0, 0) or not enough or apart:
-        return [
-            Surface.from_arrays(
+
+        def alone(m: Mesh) -> Surface:
+            return Surface.from_arrays(
                 m.vertices,
                 m.faces,
                 name=m.name,
@@ -84,8 +92,8 @@ def prepare_jointly(
                 log=m.log,
                 repairs=repairs,
             )
-            for m in counted("layout on the domain", meshes)
-        ]
+
+        return _laid_out(alone, list(zip(meshes)), processes)
     digest = hashlib.sha256()
     for c, ids in zip(cleaned, found, strict=True):
         for array in (c.vertices, c.faces, ids):
@@ -103,20 +111,34 @@ def prepare_jointly(
         stored = [cache_.read(key) for key in names]
         if all(s is not None for s in stored):
             return [
-                Surface.from_stored(m.name, domain, s)
+                replace(Surface.from_stored(m.name, domain, s), raw=(m.vertices, m.faces))
                 for m, s in zip(meshes, stored, strict=True)
                 if s is not None
             ]
     if domain.has_boundary:
-        surfaces = _cut_and_embed(
+        one, parts = _cut_alike(
             meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
         )
     else:
-        surfaces = _with_common_cones(meshes, cleaned, found, domain, parameterization)
+        one, parts = _with_common_cones(meshes, cleaned, found, domain, parameterization)
+    surfaces = _laid_out(one, parts, processes)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
-    return surfaces
+    return [
+        replace(surface, raw=(m.vertices, m.faces))
+        for m, surface in zip(meshes, surfaces, strict=True)
+    ]
+
+
+def _laid_out(
+    one: Callable[..., Surface], parts: Sequence[tuple[Any, ...]], processes: int | None
+) -> list[Surface]:
+    """The surfaces of meshes, each laid out by a call with its part, several at once."""
+    if at_once(len(parts), processes) < 2:
+        return [one(*part) for part in counted("layout on the domain", parts)]
+    at("layout on the domain")
+    return side_by_side([partial(one, *part) for part in parts], processes)
 
 
 def _with_common_cones(
@@ -125,14 +147,16 @@ def _with_common_cones(
     landmarks: Sequence[np.ndarray],
     domain: Domain,
     method: str,
-) -> list[Surface]:
+) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
+    """What lays out a mesh, and its arguments for each."""
     numbers, score = choose_common_cones([(c.vertices, c.faces) for c in cleaned], landmarks)
     line = (
         f"cones at landmarks {numbers.tolist()}, counted from 0, the same on all meshes: mean log "
         f"distortion {score:.3f}"
     )
-    return [
-        Surface.from_closed(
+
+    def one(m: Mesh, c: CleanMesh, ids: np.ndarray) -> Surface:
+        return Surface.from_closed(
             c,
             name=m.name,
             domain=domain,
@@ -140,8 +164,8 @@ def _with_common_cones(
             cones=ids[numbers].tolist(),
             log=(*m.log, *c.log, line),
         )
-        for m, c, ids in zip(meshes, cleaned, landmarks, strict=True)
-    ]
+
+    return one, list(zip(meshes, cleaned, landmarks, strict=True))
 
 
 def check_common_topology(
@@ -177,7 +201,7 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
     return kept
 
 
-def _cut_and_embed(
+def _cut_alike(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
@@ -185,7 +209,8 @@ def _cut_and_embed(
     method: str,
     seam: str,
     seam_landmarks: int | None,
-) -> list[Surface]:
+) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
+    """As :func:`_with_common_cones`, for a domain with boundary."""
     names = [m.name for m in meshes]
     best = best_common_cut(names, cleaned, landmarks, seam, seam_landmarks)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
@@ -193,8 +218,9 @@ def _cut_and_embed(
         f"seam led along {best.seam} paths through {best.count} of {len(landmarks[0])} landmarks, "
         "the same on all meshes"
     )
-    return [
-        Surface.from_cut(
+
+    def one(m: Mesh, c: CleanMesh, cut: Cut, key: np.ndarray) -> Surface:
+        return Surface.from_cut(
             cut,
             c,
             name=m.name,
@@ -203,11 +229,8 @@ def _cut_and_embed(
             keys=Keys(key, fractions),
             log=(*m.log, *c.log, line),
         )
-        for m, c, cut, key in counted(
-            "layout on the domain",
-            list(zip(meshes, cleaned, best.cuts, best.keys, strict=True)),
-        )
-    ]
+
+    return one, list(zip(meshes, cleaned, best.cuts, best.keys, strict=True))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangl
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
-from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies, seam_pairs
+from nsm.surfaces.cutting import Cut, chords_joined, cut_to_disc, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays
@@ -55,7 +55,7 @@ class Surface:
         lattice: (2, 2) on a closed domain: the surface is least distorted in the plane of
             (lattice / 2) uv, where it has the area of Ω. None elsewhere.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
-            a surface of a run folder.
+            an analytic surface, and for one that an older version stored.
     """
 
     name: str
@@ -343,6 +343,15 @@ class Surface:
         """
         _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    def file_faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """The faces before copies were made and points inserted.
+
+        Returns:
+            Faces (G, 3) of vertices of the mesh file, and the same (G, 3) of vertices here.
+        """
+        corners = chords_joined(self.faces, self.source_vertex < 0)[0]
+        return self.source_vertex[corners], corners
 
     @property
     def topology(self) -> tuple[int, int]:

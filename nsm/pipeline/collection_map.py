@@ -13,12 +13,12 @@ from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
 from nsm.domains.joint_preparation import Matched, matched_landmarks
-from nsm.domains.orbifold.alignment import alignments_to_first
+from nsm.domains.orbifold.collection_alignment import alignments_to_first, disagreements
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -34,11 +34,20 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_tears,
+    write_correspondences,
 )
+from nsm.results.collection_pictures import cycle_picture
+from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import start_figures
 from nsm.tasks import CollectionMap
-from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import (
+    aligned,
+    carried,
+    landmark_rotation,
+    least_distorting_rotation,
+)
 
 _SEAM_POINTS = 24  # on each branch
 _RINGS = 80  # of an even mesh of the common domain
@@ -57,6 +66,7 @@ class CollectionMapTask(Task):
     closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
+    proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -76,7 +86,9 @@ class CollectionMapTask(Task):
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console
+        )
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
@@ -86,11 +98,17 @@ class CollectionMapTask(Task):
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)
-        self.targets, self.starts = targets, self._starts(targets)
+        self.starts = self._starts(targets)
         back = torch.stack([h.back(q) for h, q in zip(self.starts, targets, strict=True)])
         if not self.domain.has_boundary:
-            back = torch.stack([self.domain.lift(x, targets[0]) for x in back])
+            back = torch.stack(
+                [self.domain.lift(x, targets[0], self.surface.lattice) for x in back]
+            )
         self.points = back.mean(dim=0)
+        near = zip(self.phis, self.starts, targets, strict=True)
+        self.targets = torch.stack(
+            [self.domain.lift(q, h.before(self.points), phi.surface.lattice) for phi, h, q in near]
+        )
         on_boundary = slice(self.matched.on_boundary)
         if self.domain.has_boundary:
             self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
@@ -100,7 +118,16 @@ class CollectionMapTask(Task):
         surfaces = [phi.surface for phi in self.phis]
         if not self.domain.has_boundary:
             common = self.ids if targets.shape[1] else None
-            return [aligned(found.inverse) for found in alignments_to_first(surfaces, common)]
+            to_first = alignments_to_first(surfaces, common)
+            for pair in disagreements(surfaces, to_first, common):
+                ends = f"{surfaces[pair.source].name} → {surfaces[pair.target].name}"
+                self.console.print(
+                    f"{ends}: the isotopy class that follows from the other pairs scores "
+                    f"{pair.composed.score:.3f}, the pair's own best {pair.own.score:.3f}; if the "
+                    "map is distorted, map the pair alone or check its landmarks",
+                    soft_wrap=True,
+                )
+            return [aligned(found.inverse) for found in to_first]
         uv = torch.as_tensor(self.surface.uv, dtype=torch.float32)
         some = uv[:: len(uv) // 4096 + 1]
         first, *others = self.phis
@@ -118,11 +145,18 @@ class CollectionMapTask(Task):
         return f"{self.name} of {len(self.phis)} surfaces"
 
     def build(self) -> Any:
+        points, targets = self.points, self.targets
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
+            # as for pairs: the corners are key points (METHOD)
+            corners = torch.from_numpy(self.domain.corners).to(points)
+            points = torch.cat([points, corners])
+            kept = torch.stack([start.before(corners) for start in self.starts])
+            targets = torch.cat([targets, kept], dim=1)
         names = [phi.surface.name for phi in self.phis]
         return self.module(
             **self.map_settings(),
-            points=self.points,
-            targets=self.targets,
+            points=points,
+            targets=targets,
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
             starts=self.starts,
             mesh=self._mesh(),
@@ -175,6 +209,15 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+        for (i, j), name in result.pair_names.items():
+            figures = result.metrics["pairs"][name]
+            source, target = self.phis[i].surface, self.phis[j].surface
+            if self.trained is not None:
+                before = flipped_percent(self.trained.pair(i, j).image_uv, source.faces)
+                figures["flipped_before_repair_percent"] = before
+            ends = self.starts[j], self.starts[i]
+            first, places = (carried(x, *ends) for x in (source.uv, self.matched.points[i]))
+            figures |= start_figures(source, target, first, places, self.matched.points[j])
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
         every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
@@ -197,9 +240,15 @@ class CollectionMapTask(Task):
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
         return evaluate(module.map[-1], start.numpy())
 
+    def save(self, folder: Path, result: SurfaceCollection) -> None:
+        super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
+
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)
         transfer_matrix_picture(folder / "transfer.png", result)
+        cycle_picture(folder / "cycle.png", result)
         for i, source in enumerate(result.surfaces):
             for j, target in enumerate(result.surfaces):
                 if i != j:
@@ -211,6 +260,7 @@ class CollectionMapTask(Task):
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.welded_image)
         np.save(folder / "mapped_vertices.npy", image)
+        write_correspondences(folder / "correspondences.npz", f)
         vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
         export_surface(file, vertices, target.surface, f.source_uv)

@@ -15,13 +15,13 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     Parameterization,
-    checkerboard,
     comparison_table,
-    export_mesh,
+    export_surface,
     layout_image,
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.patterns import write_patterns
@@ -76,6 +76,10 @@ class ParamTask(Task):
         for name, uv in maps.items():
             result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
         result.metrics["nsm"].update(result.certificate)
+        if self.trained is not None:
+            result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(
+                self.trained.uv, surface.faces, mirrored=True
+            )
 
     def picture(self, module: Any) -> np.ndarray:
         image = layout_image(self.surface, evaluate(module, self.surface.uv))
@@ -89,11 +93,12 @@ class ParamTask(Task):
     def write_artefacts(self, folder: Path, result: Parameterization) -> None:
         surface = self.surface
         inside = _into_square(result.uv)
-        for ending, texture in (("obj", None), ("glb", checkerboard())):
-            file = folder / f"parameterized.{ending}"
-            export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
+        vertices = self.phi.in_original_units(surface.vertices)
+        for ending in (".obj", ".glb"):
+            export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
         write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
-        before_after = {"before: domain Ω": surface.uv, "after": result.uv}
+        energy = str(self.config.energy["_target_"]).rpartition(".")[2]
+        before_after = {"before: domain Ω": surface.uv, f"after: {energy}": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
 

@@ -71,8 +71,8 @@ def read_shape(given: Any, domain: Domain, key: str, trust: Iterable[str] = ()) 
     if isinstance(given, Surface):
         if given.raw is None:
             raise NsmError(
-                f"{key}={given.name}: a surface of a run folder has no mesh to prepare again; give "
-                "its neural surface or the mesh file",
+                f"{key}={given.name}: no mesh of a file is known to prepare it again; give its "
+                "neural surface or the mesh file",
                 kind="wrong_type",
                 key=key,
             )
@@ -149,7 +149,7 @@ def landmark_vertices(
     names = [_name(shape) for shape in shapes]
     lists = [
         listed(item, f"landmarks of {name}")
-        for item, name in zip(_lists(given, len(shapes), console), names, strict=True)
+        for item, name in zip(landmark_lists(given, len(shapes), console), names, strict=True)
     ]
     check_equal_lengths(names, lists)
     result = []
@@ -168,7 +168,8 @@ def landmark_vertices(
     return result
 
 
-def _lists(given: Any, count: int, console: Console) -> list[Any]:
+def landmark_lists(given: Any, count: int, console: Console) -> list[Any]:
+    """Landmarks as :func:`landmark_vertices` takes them, as a list for each of ``count`` shapes."""
     if given is None:
         return [[] for _ in range(count)]
     lists: list[Any]
@@ -314,6 +315,7 @@ def neural_surfaces(
                 seam_landmarks=config.seam.landmarks,
                 cache=config.surface.cache,
                 repairs=configured_repairs(config),
+                processes=config.phi.get("processes"),
             )
         if not ready:
             _check_landmarks(prepared, landmarks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -206,13 +207,17 @@ def finish(
 def _print_figures(task: Task, run: Run, result: Any, seconds: float) -> None:
     """A table and warnings; of a neural surface that a map needs, one line."""
     if run.inner:
-        task.console.print(
-            f"{task.surface.name}: neural surface in {seconds:.0f} s, RMS distance "
-            f"{result.metrics['rms_percent']:.3f} % of the diagonal",
-            soft_wrap=True,
-        )
+        task.console.print(made_line(task.surface.name, result.metrics, seconds), soft_wrap=True)
         return
     if task.table is not None:
         task.console.print(task.table(result.metrics))
     for warning in task.warnings(result):
         task.console.print(warning, soft_wrap=True)
+
+
+def made_line(name: str, metrics: Mapping[str, float], seconds: float) -> str:
+    """What is said of a neural surface that a map needed, in one line."""
+    return (
+        f"{name}: neural surface in {seconds:.0f} s, RMS distance {metrics['rms_percent']:.3f} % "
+        "of the diagonal"
+    )

@@ -70,6 +70,8 @@ class Task:
         domain: Ω.
         console: where to print.
         surface: the surface whose name and preparation metrics.json reports.
+        trained: if the task is certified, the result as it was trained, before any repair; None
+            before that.
     """
 
     module: ClassVar[type[Training]]
@@ -84,6 +86,7 @@ class Task:
     domain: Any  # nsm.domains.Domain; maps need more of it than a domain without boundary has
     console: Console
     surface: Surface
+    trained: Any = None
 
     def __init__(self, name: str = "task") -> None:
         self.name = name

@@ -76,10 +76,14 @@ class GradientWatch(Callback):
         stop_norm: stop when the mean norm of the last ``window`` steps is below, with warm
             restarts only where a wave ends; None: never.
         window: the number of steps that are averaged.
+        summed: take the norm of the loss summed over the batch: that of the mean, which is trained
+            and logged, times the number of samples.
     """
 
-    def __init__(self, every: int, stop_norm: float | None, window: int) -> None:
-        self.every, self.stop_norm = every, stop_norm
+    def __init__(
+        self, every: int, stop_norm: float | None, window: int, *, summed: bool = False
+    ) -> None:
+        self.every, self.stop_norm, self.summed = every, stop_norm, summed
         self.recent: deque[float] = deque(maxlen=window)
 
     def on_before_optimizer_step(
@@ -107,7 +111,9 @@ class GradientWatch(Callback):
     ) -> None:
         full = len(self.recent) == self.recent.maxlen
         if self.stop_norm is not None and full and _may_stop(trainer):
-            if sum(self.recent) / len(self.recent) < self.stop_norm:
+            # each of several processes has its part of the batch
+            samples = _samples(batch) * trainer.world_size if self.summed else 1
+            if samples * sum(self.recent) / len(self.recent) < self.stop_norm:
                 trainer.should_stop = True
 
     def state_dict(self) -> dict[str, Any]:
@@ -115,6 +121,11 @@ class GradientWatch(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.recent.extend(state_dict["recent"])
+
+
+def _samples(batch: Any) -> int:
+    """How many samples a batch has: a tensor (N, ...), or a tuple of such."""
+    return len(batch if isinstance(batch, torch.Tensor) else batch[0])
 
 
 def _may_stop(trainer: pl.Trainer) -> bool:

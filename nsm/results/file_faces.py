@@ -6,11 +6,16 @@ that has stayed whole is found by its vertices. Points of others go to the neare
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.surfaces.location import Places, locate
+
+if TYPE_CHECKING:
+    from nsm.results.artifact import NeuralSurface
 
 _SAME = 1e-5  # of the mesh's size: vertices of one mesh in files of single precision
 
@@ -86,6 +91,43 @@ class FileFaces:
             near = locate(given.take(self.file_vertices, self.file_faces), s.vertices, s.faces)
             face[lost], weights[lost] = near
         return Places(face, weights)
+
+
+def same_mesh(one: NeuralSurface, other: NeuralSurface) -> bool:
+    """Whether two surfaces were prepared from one mesh, perhaps cut or laid out differently."""
+    if one is other:
+        return True
+    (a, f), (b, g) = one.file_mesh(), other.file_mesh()
+    if one.surface.raw is None or other.surface.raw is None:
+        # the file's order of faces is lost
+        f, g = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (f, g))
+    if a.shape != b.shape or not np.array_equal(f, g):
+        return False
+    size = float(np.ptp(a, axis=0).max(initial=0.0))
+    return bool(np.abs(a - b).max(initial=0.0) <= _SAME * size)
+
+
+def faces_of_file(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """The surface's faces as they are in the mesh file: in its order, by its vertex numbers.
+
+    Faces that the preparation added, such as those over a hole, are left out. An older version's
+    surface has lost the file's order.
+
+    Returns:
+        Faces (G, 3) of vertices of the file, and the same corners (G, 3) as vertices of the
+        surface, whose copies at a seam are told apart.
+    """
+    faces, corners = surface.file_faces()
+    if surface.raw is None:
+        return faces, corners
+    given = surface.raw[1]
+    row = surface.cut_vertex
+    kept = np.where(row >= 0, surface.source_vertex[row], -1)[given]
+    file_face, own_face = _matched(kept, faces)
+    order = np.argsort(file_face, kind="stable")
+    file_face, own_face = file_face[order], own_face[order]
+    same = kept[file_face][:, :, None] == faces[own_face][:, None, :]
+    return given[file_face], np.take_along_axis(corners[own_face], same.argmax(axis=2), axis=1)
 
 
 def _matched(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

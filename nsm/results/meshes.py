@@ -11,8 +11,10 @@ from PIL import Image
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
+from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
 from nsm.results.textures import checkerboard, checkerboard_at
+from nsm.results.vertex_values import mean_by_file_vertex
 
 
 class ColouredMesh(NamedTuple):
@@ -90,16 +92,21 @@ def export_surface(
     """Write a surface's mesh with other vertices (V, 3), and a checkerboard over coordinates uv
     (V, 2); arguments and errors as for :func:`export_mesh`.
 
-    A surface on a closed domain is written whole, with the vertices and faces of its file and
-    without coordinates.
+    An OBJ file has the vertices and faces of the surface's file, in its order: the copies of a seam
+    vertex go to their mean, and keep their own texture coordinates. A GLB file has a vertex for
+    each copy. A surface on a closed domain is written whole, without coordinates.
     """
-    glb = Path(path).suffix.lower() == ".glb"
-    if surface.domain.has_boundary:
-        export_mesh(path, vertices, surface.faces, uv, texture=checkerboard() if glb else None)
+    bounded = surface.domain.has_boundary
+    if Path(path).suffix.lower() == ".glb":
+        if bounded:
+            export_mesh(path, vertices, surface.faces, uv, texture=checkerboard())
+            return
+        first, faces = surface.whole()
+        export_mesh(path, vertices[first], faces, None, colours=checkerboard_at(uv[first]))
         return
-    first, faces = surface.whole()
-    colours = checkerboard_at(uv[first]) if glb else None
-    export_mesh(path, vertices[first], faces, None, colours=colours)
+    faces, corners = faces_of_file(surface)
+    points = mean_by_file_vertex(surface, vertices)
+    export_mesh(path, points, faces, uv if bounded else None, corners=corners)
 
 
 def _glb(

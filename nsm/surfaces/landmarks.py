@@ -1,7 +1,8 @@
 """Landmarks: corresponding points of surfaces, as vertices of the meshes.
 
 A landmark is a vertex number, a point [x, y, z], or a place [triangle, b0, b1, b2] with barycentric
-coordinates. Maps take landmarks at vertices: of the other two, the nearest vertex.
+coordinates. Maps take landmarks at vertices: of a point the nearest one; a place becomes a vertex
+where a mesh is prepared for the map, and is the nearest one elsewhere.
 """
 
 from __future__ import annotations
@@ -78,6 +79,21 @@ def _nearest_corners(
     if faces is None:
         reason = "the triangles of its file are not known here; give vertices, or the mesh file"
         raise error_in(name, "wrong_type", reason)
+    check_places(given, faces, name)
+    at = Places(given[:, 0].astype(np.int64), given[:, 1:]).take(vertices, faces)
+    corners = faces[given[:, 0].astype(np.int64)]
+    distance = np.linalg.norm(vertices[corners] - at[:, None], axis=2)
+    nearest = distance.argmin(axis=1)
+    rows = np.arange(len(given))
+    return AtVertices(corners[rows, nearest].astype(np.int64), distance[rows, nearest])
+
+
+def check_places(given: np.ndarray, faces: np.ndarray, name: str) -> None:
+    """Check that places (L, 4) are on triangles (F, 3).
+
+    Raises:
+        NsmError: ``out_of_range``: no such triangle; ``not_on_surface``: outside its triangle.
+    """
     for k, (face, *weights) in enumerate(given.tolist()):
         if not 0 <= face < len(faces) or not face.is_integer():
             reason = f"landmark {k} is in triangle {face:g}; give triangles 0 to {len(faces) - 1}"
@@ -85,12 +101,6 @@ def _nearest_corners(
         if abs(sum(weights) - 1) > _SUM or min(weights) < -_SUM:
             reason = f"landmark {k} has the coordinates {weights}; they are positive, with sum 1"
             raise error_in(name, "not_on_surface", reason)
-    at = Places(given[:, 0].astype(np.int64), given[:, 1:]).take(vertices, faces)
-    corners = faces[given[:, 0].astype(np.int64)]
-    distance = np.linalg.norm(vertices[corners] - at[:, None], axis=2)
-    nearest = distance.argmin(axis=1)
-    rows = np.arange(len(given))
-    return AtVertices(corners[rows, nearest].astype(np.int64), distance[rows, nearest])
 
 
 def numbered(given: Landmarks, numbers: np.ndarray, name: str) -> Landmarks:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
 from nsm.maps import LatticeAligned, Rotated, batched
+from nsm.settings import CollectionConstraints
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
@@ -29,7 +30,8 @@ class CollectionMap(ConstrainedMap):
     i. The loss is METHOD's sum over all ordered pairs, divided by k(k − 1): each surface takes
     part in 2(k − 1) pairs, so its energy and its constraints have the same proportion for all k,
     and the loss does not grow with k. Four is the number of surfaces for which the default weights
-    were measured. Multipliers are scaled like the term C.
+    were measured. Multipliers are scaled like the term C. With ``constraints.pairs=sum`` the loss
+    is METHOD's: the sum over all ordered pairs, and Σ_i of the other terms without the 4/k.
 
     Args:
         map, activation, encoding: settings of each h_i's network.
@@ -49,6 +51,9 @@ class CollectionMap(ConstrainedMap):
     Raises:
         ValueError: a constraint that is not known.
     """
+
+    Constraints = CollectionConstraints
+    constraints: CollectionConstraints
 
     def __init__(
         self,
@@ -99,7 +104,9 @@ class CollectionMap(ConstrainedMap):
         return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
-        w, ramp, scale = self.loss_weights, self.ramp, _SURFACES / len(self.map)
+        w, ramp, k = self.loss_weights, self.ramp, len(self.map)
+        summed = self.constraints.pairs == "sum"
+        pairs, scale = (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
@@ -109,7 +116,7 @@ class CollectionMap(ConstrainedMap):
         U = self._triangle_term() if w.triangles > 0 else 0.0
         C, multipliers = self.landmark_terms()
 
-        loss = energy + scale * (
+        loss = pairs * energy + scale * (
             multipliers
             + w.injectivity * G
             + w.boundary * B
@@ -118,7 +125,7 @@ class CollectionMap(ConstrainedMap):
             + w.landmarks * C
         )
         terms: dict[str, Term] = {
-            **distortion.terms,
+            **{name: (pairs * weight, E) for name, (weight, E) in distortion.terms.items()},
             "multipliers": (scale, multipliers),
             "injectivity": (scale * w.injectivity, G),
             "boundary": (scale * w.boundary, B),

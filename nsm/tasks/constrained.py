@@ -65,7 +65,7 @@ class ConstrainedMap(Training):
         super().__init__()
         self.domain, self.energy = domain, as_blend(energy)
         self.loss_weights = PairWeights(**loss_weights)
-        self.constraints = PairConstraints(**constraints)
+        self.constraints = self.Constraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
@@ -77,10 +77,8 @@ class ConstrainedMap(Training):
         """Register landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point.
 
-        On a closed domain, the targets' lifts nearest to the start are wanted.
+        On a closed domain, the targets are the lifts that h should meet.
         """
-        lifted = self.domain.lift(targets.flatten(0, -2), start.flatten(0, -2))
-        targets = lifted.view_as(targets)
         given = {"points": points, "targets": targets, "start": start, "seam": seam}
         if not self.exact:
             given["boundary_samples"] = self.domain.boundary_samples()

@@ -21,6 +21,7 @@ from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline import run
 from nsm.results import load_surface
+from nsm.results.metrics import evaluate
 from nsm.results.report import write_report
 from nsm.results.report.labels import labels, over_seeds
 from nsm.results.report.runs import find_runs
@@ -149,7 +150,7 @@ def test_histograms_are_the_distortion_of_the_triangles(runs, page):
     overfit = task(page, "overfit")
     number = [one["name"] for one in overfit["runs"]].index("sweep/1")
     phi = load_surface(runs / "sweep" / "1")
-    image, values, areas = phi(phi.surface.uv), [], []
+    image, values, areas = evaluate(phi.map, phi.surface.uv), [], []
     for corners in phi.surface.faces:
         x, y = phi.surface.vertices[corners], image[corners]
         e, g = np.stack([x[1] - x[0], x[2] - x[0]], 1), np.stack([y[1] - y[0], y[2] - y[0]], 1)
@@ -173,7 +174,7 @@ def test_shapes_are_those_of_the_runs_and_shared_arrays_are_stored_once(runs, pa
         phi = load_surface(runs / one["name"])
         shape = one["shapes"][0]
         vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
-        assert np.allclose(vertices, phi(phi.surface.uv), atol=1e-5)
+        assert np.allclose(vertices, evaluate(phi.map, phi.surface.uv), atol=1e-5)
         assert np.array_equal(unpacked(shown, shape["faces"]).reshape(-1, 3), phi.surface.faces)
     assert len({one["shapes"][0]["faces"] for one in overfit["runs"]}) == 1
     mapped = next(one for one in shown["tasks"] if one["name"] == "pair_map")["runs"][0]
@@ -210,7 +211,7 @@ def test_a_fine_mesh_is_decimated_for_the_page(runs, monkeypatch, tmp_path):
     vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
     faces = unpacked(shown, shape["faces"]).reshape(-1, 3)
     assert 50 < len(faces) <= 100 < len(phi.surface.faces)
-    known = phi(phi.surface.uv)
+    known = evaluate(phi.map, phi.surface.uv)
     assert all(np.abs(known - vertex).max(axis=1).min() < 1e-5 for vertex in vertices[::7])
     for colour in shape["colours"].values():
         count = len(faces) if colour["of"] == "faces" else len(vertices)

@@ -12,12 +12,13 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
 from nsm.results.collection import load_collection
-from nsm.results.metrics import vertex_error
+from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.pair_metrics import ENERGIES, triangle_energies
 from nsm.results.parameterization import load_parameterization
 from nsm.results.render import UP_AXES, frames_of
 from nsm.results.report.runs import short
-from nsm.results.surface_map import SurfaceMap, load_surface_map
+from nsm.results.stored_map import load_surface_map
+from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces.geometry import decimate
 from nsm.surfaces.topology import face_areas
 
@@ -77,7 +78,7 @@ def read_shapes(
 def _overfit(folder: Path, trust: Sequence[str]) -> _Read:
     neural = load_surface(folder, trust=trust)
     surface = neural.surface
-    vertices, faces = neural(surface.uv), surface.faces
+    vertices, faces = evaluate(neural.map, surface.uv), surface.faces
     distortion = _measured(surface.vertices, vertices, faces)
     colours = {
         "distance, % of diagonal": vertex_error(surface, neural.map),

@@ -20,7 +20,8 @@ from nsm.results.pictures import GREY, checked, fine, layout_image, panels, save
 from nsm.results.render import Blend, View, vertex_normals
 from nsm.results.report.labels import OverSeeds, labels, over_seeds
 from nsm.results.report.runs import Run, find_runs
-from nsm.results.surface_map import SurfaceMap, load_surface_map
+from nsm.results.stored_map import load_surface_map
+from nsm.results.surface_map import SurfaceMap
 from nsm.results.tables import FIGURES
 
 FIGURE, TABLE = "sweep.png", "sweep.csv"

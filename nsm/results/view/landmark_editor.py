@@ -148,7 +148,7 @@ class LandmarkEditor:
                 colours.append(_carried(colours[0], found.candidate, shape.vertices))
                 worst = int(found.off.argmax())
                 lines.append(
-                    f"{source.name} → {shape.name}: mean energy {found.energy:.2f} (4 at best); "
+                    f"{source.name} → {shape.name}: mean energy {found.energy:.2f} (3.98 at best); "
                     f"{names[worst]} is farthest off, {found.off[worst]:.2f} of √area"
                 )
         except NsmError as error:

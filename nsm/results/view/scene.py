@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm, Normalize
 from nsm.domains import Surface
 from nsm.results.artifact import NeuralSurface
 from nsm.results.meshes import by_position
-from nsm.results.metrics import vertex_error
+from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.pair_metrics import triangle_energies
 from nsm.results.parameterization import Parameterization
 from nsm.results.pictures import GREY, vertex_means
@@ -242,7 +242,7 @@ def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y
 
 def _overfit(neural: NeuralSurface, frame: np.ndarray) -> Scene:
     s = neural.surface
-    image = neural(s.uv)
+    image = evaluate(neural.map, s.uv)
     errors = {"distance, % of diagonal": vertex_error(s, neural.map)}
     centre = _centre(s.vertices, frame)
     source = _file_shape(f"{s.name}: mesh", neural, s.vertices - centre, s.vertices)
