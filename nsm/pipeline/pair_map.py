@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nsm.data import SurfaceData
-from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.joint_preparation import matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
@@ -103,6 +103,7 @@ class PairMapTask(Task):
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(source=phi, target=psi))
         refuse_other_topology([phi, psi])
+        ids = with_ends([phi.surface, psi.surface], ids)
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
