@@ -144,8 +144,9 @@ class NeuralSurface:
             NsmError: ``out_of_range``: count is not from 1 to the number of vertices less one.
         """
         s = self.surface
-        vertex, inserted = s.source_vertex, s.source_vertex < 0
-        joined = np.where(inserted, len(s.cut_vertex) + np.arange(len(vertex)), vertex)
+        vertex = s.source_vertex
+        # points inserted between others have no copies; those in filled holes may have
+        joined = np.where(vertex == -1, len(s.cut_vertex) + np.arange(len(vertex)), vertex)
         most = len(np.unique(joined)) - 1
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
             message = f"count: {count!r} is not a whole number from 1 to {most}"

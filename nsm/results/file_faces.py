@@ -66,19 +66,19 @@ class FileFaces:
         )
 
     def to_file(self, places: Places) -> Places:
-        """Places on the surface as places on the file's mesh."""
+        """Places on the surface as places on the file's mesh, the nearest ones to filled holes."""
+        s = self.surface
         face = self._file_face[places.face]
         weights = np.zeros_like(places.weights)
         np.put_along_axis(weights, self._corner[places.face], places.weights, axis=1)
         lost = np.flatnonzero(face < 0)
-        if len(lost):
-            s = self.surface
-            chosen = np.flatnonzero(self._surface_face < 0)
-            if len(chosen) == 0:
-                chosen = np.arange(len(self.file_faces))
-            points = Places(places.face[lost], places.weights[lost]).take(s.vertices, s.faces)
-            near = locate(points, self.file_vertices, self.file_faces[chosen])
-            face[lost], weights[lost] = chosen[near.face], near.weights
+        over = s.filled[places.face[lost]]
+        every, split = np.arange(len(self.file_faces)), np.flatnonzero(self._surface_face < 0)
+        for rows, chosen in ((lost[~over], split if len(split) else every), (lost[over], every)):
+            if len(rows):
+                points = Places(places.face[rows], places.weights[rows]).take(s.vertices, s.faces)
+                near = locate(points, self.file_vertices, self.file_faces[chosen])
+                face[rows], weights[rows] = chosen[near.face], near.weights
         return Places(face, weights)
 
     def to_surface(self, places: Places) -> Places:

@@ -49,8 +49,9 @@ class Reliability(NamedTuple):
 def reliability(f: SurfaceMap) -> Reliability:
     """The figures of a map at the vertices of its source's file (see :class:`Reliability`)."""
     s, t = f.source.surface, f.target.surface
-    around = s.source_vertex[s.faces]  # -1 at inserted points
-    rows, known = around[around >= 0], around >= 0
+    around = s.source_vertex[s.faces]  # negative at inserted points
+    known = (around >= 0) & ~s.filled[:, None]
+    rows = around[known]
     areas = face_areas(s.vertices, s.faces)
     energy, stretch = _of_triangles(s, f.image, f.image_uv)
     count = len(s.cut_vertex)

@@ -23,6 +23,7 @@ from nsm.results import (
 from nsm.results.file_faces import faces_of_file
 from nsm.results.morph_target import write_morph_target
 from nsm.surfaces.gltf import check_gltf
+from nsm.surfaces.validation import Repairs
 
 NEURAL, _, PAIR, _ = results(rings=5)
 
@@ -179,3 +180,23 @@ def test_reliability_is_written_at_the_vertices_of_the_file(cut, tmp_path):
     data = mesh.metadata["_ply_raw"]["vertex"]["data"]
     for name, values in cut.reliability._asdict().items():
         assert np.array_equal(data[name].ravel(), values)
+
+
+def test_points_over_filled_holes_go_to_the_nearest_face_of_the_file(cut):
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    faces = mesh.faces[~(mesh.faces == 40).any(axis=1)]
+    vertices = np.asarray(mesh.vertices)
+    surface = nsm.Surface.from_arrays(vertices, faces, repairs=Repairs("largest", None, 9))
+    f = SurfaceMap(NeuralSurface(surface, NEURAL[0].map), cut.target, PAIR.map, cut.landmarks)
+    assert surface.filled.any()
+    np.testing.assert_array_equal(faces_of_file(surface)[0], faces)
+    origin = f.correspondences(back=True).take(vertices, faces)
+    t = f.target.surface
+    once = np.setdiff1d(np.arange(len(t.cut_vertex)), t.source_vertex[t.seam_pairs.ravel()])
+    off = np.linalg.norm(origin - f.inverse(f.target.file_mesh()[0]), axis=1)[once]
+    assert np.quantile(off, 0.8) < 1e-6 and off.max() < 0.3  # over the hole, at its rim
+    distortion, stretch, _ = f.reliability
+    assert np.isnan(distortion[40]) and np.isnan(stretch[40])
+    assert np.isfinite(np.delete(distortion, 40)).all()
+    values, functions = f.source.spectrum(3)
+    assert abs(values[0]) < 1e-6 and len(functions) == len(vertices)
