@@ -204,7 +204,10 @@ class SurfaceSettings:
             falling area, says which is kept; null: small ones are removed, others refused.
         repair: split cuts a mesh apart at non-manifold edges (three faces or more); null: it is
             refused.
-        parameterization: of the mesh over Ω: slim (low distortion) or tutte.
+        fill_holes: fill holes of at most so many edges for the map; true: small ones, shorter than
+            half the square root of the area; exported meshes keep the holes.
+        parameterization: of the mesh over Ω: slim (low distortion) or tutte; or given, of an OBJ,
+            PLY or GLB file: it is cut and laid out as its texture coordinates are.
         cache: keep the prepared surface on disk, under a hash of its content.
     """
 
@@ -214,7 +217,8 @@ class SurfaceSettings:
     cones: list[int] | None = None
     parts: Literal["largest"] | Whole | None = None
     repair: Literal["split"] | None = None
-    parameterization: Literal["slim", "tutte"] = "slim"
+    fill_holes: bool | Count = False
+    parameterization: Literal["slim", "tutte", "given"] = "slim"
     cache: bool = True
 
 
@@ -455,15 +459,23 @@ class Settings:
         source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface.
         target: the same; or an analytic surface: a name (sphere_cap, plane, ...; sphere with
             domain=orbifold, torus with domain=torus) or '{name: graph, z: 0.3*u*v}'.
-        surfaces: of task=collection_map: three surfaces or more, each as source.
+        surfaces: of task=collection_map: three surfaces or more, each as source; or a pattern of
+            files, 'surfaces=scans/*.ply'.
+        template: of task=collection_map: a surface as source, which every other is mapped to and
+            from; landmarks are numbered or named as on it.
         landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned, .bary, .pp or
             .json, one for each surface, or the names of meshes of the catalogue that have some; or
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
-            b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
+            b2] with barycentric coordinates, stands for the vertex nearest to it, and -1 or null
+            for a landmark that the surface lacks; a CSV file with a column for each surface; a
+            folder with a file for each surface, of its name; auto, for
             closed meshes of genus 0: landmarks are proposed, as they are where none are given;
             []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
+        seams: of task=param: edges along which the mesh is cut, as a list of pairs of vertices or a
+            file of them; lines: the l lines of the OBJ file; uv: the borders of the islands of its
+            texture coordinates. Several charts are flattened one by one and packed into an atlas.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the
             materials of its file. It is baked to the target, as target_textured.obj and .glb; the
             target's own texture, if it has one, to the source.
@@ -482,8 +494,10 @@ class Settings:
     phi: PhiSettings = field(default_factory=PhiSettings)
     source: str | dict[str, Any] | None = None
     target: str | dict[str, Any] | None = None
-    surfaces: list[Any] | None = None
+    surfaces: str | list[Any] | None = None
+    template: str | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
+    seams: str | list[Any] | None = None
     texture: str | None = None
     texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)

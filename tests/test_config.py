@@ -495,7 +495,8 @@ def test_a_users_own_files(tmp_path, here):
     (folder / "optimizer" / "mine.yaml").write_text("_target_: torch.optim.NAdam\nlr: 0.5\n")
     result = here("--config-dir=conf", "--cfg", "job", "experiment=mine")
     config = yaml.safe_load(result.stdout)
-    assert config["optimizer"] == {"_target_": "torch.optim.NAdam", "lr": 0.5}
+    wanted = {"_target_": "torch.optim.NAdam", "lr": 0.5, "encoding_lr": None}
+    assert config["optimizer"] == wanted
     assert config["trainer"]["max_steps"] == 3
 
 

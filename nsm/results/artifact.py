@@ -22,6 +22,7 @@ from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, check_points
 from nsm.results.vertex_values import by_file_vertex
+from nsm.surfaces.holes import FIRST
 
 FORMAT = "nsm-surface"
 STEM = "surface"
@@ -149,7 +150,7 @@ class NeuralSurface:
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
             message = f"count: {count!r} is not a whole number from 1 to {most}"
             raise NsmError(message, kind="out_of_range", key="count")
-        values, functions = spectrum(self.module(), s.uv, s.faces, count, joined=joined)
+        values, functions = spectrum(self.module().cpu(), s.uv, s.faces, count, joined=joined)
         return values, by_file_vertex(s, functions)
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -157,13 +158,10 @@ class NeuralSurface:
 
         On a closed domain these are the vertices and faces of the mesh file, without copies, so
         that the mesh is closed; uv is then one lift of each vertex. Elsewhere they are those of the
-        cut mesh, ``surface``.
+        cut mesh, ``surface``. Filled holes are left out.
         """
-        surface = self.surface
-        if surface.domain.has_boundary:
-            return self(surface.uv), surface.faces, surface.uv
-        first, faces = surface.whole()
-        return self(surface.uv[first]), faces, surface.uv[first]
+        uv, (shown, faces) = self.surface.uv, self.surface.shown()
+        return self(uv[shown]), faces, uv[shown]
 
     def in_original_units(self, points: np.ndarray) -> np.ndarray:
         """Normalised points (N, 3) in the units and place of the mesh file.
@@ -263,11 +261,11 @@ def _check_arrays(surface: Surface) -> None:
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
     for name, array in surface.arrays().items():
-        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
+        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs", "ends")
         if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")
-    if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
-        raise ValueError("no faces, or source_vertex below -1")
+    if len(surface.faces) == 0 or surface.source_vertex.min() < FIRST - count:
+        raise ValueError("no faces, or more filled holes than vertices")
     cut = surface.cut_vertex
     if cut.ndim != 1 or not surface.source_vertex.max() < len(cut):
         raise ValueError("source_vertex names a vertex that the mesh file does not have")

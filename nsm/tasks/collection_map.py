@@ -39,7 +39,7 @@ class CollectionMap(ConstrainedMap):
         max_steps, domain, energy, loss_weights, constraints, loss_terms: see
             :class:`nsm.tasks.constrained.ConstrainedMap`.
         points: (K, 2) landmarks in the common domain.
-        targets: (k, K, 2) the same in each surface's own.
+        targets: (k, K, 2) the same in each surface's own; NaN where a surface lacks the landmark.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
         starts: where each h_i starts, a rotation or, on a closed domain, an affine map: maps around
             the identity.
@@ -195,4 +195,5 @@ class CollectionMap(ConstrainedMap):
     def landmark_error(self) -> Tensor:
         phis = batched(list(self.phis))
         units = self.targets.new_tensor(self.diagonals)[:, None]
-        return 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
+        every = 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
+        return every[self.there]

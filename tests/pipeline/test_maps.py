@@ -18,7 +18,7 @@ from nsm.domains import Square
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline import Given, built, make_task, run_task
-from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.results import analytic_surface
 from nsm.results.metrics import evaluate
 from nsm.results.textured_mesh import TexturedMesh

@@ -44,7 +44,8 @@ def alignments_to_first(
 
     Args:
         surfaces: on the same closed domain.
-        landmarks: corresponding vertices (L,) of each mesh file, if any.
+        landmarks: corresponding vertices (L,) of each mesh file, if any; -1 for one that a mesh
+            lacks.
 
     Raises:
         NsmError: as :func:`nsm.domains.orbifold.alignment.alignments`.
@@ -108,7 +109,11 @@ def disagreements(
 
 
 def _common(landmarks: Sequence[np.ndarray] | None, i: int, j: int) -> Landmarks | None:
-    return None if landmarks is None else (landmarks[i], landmarks[j])
+    """The landmarks that two surfaces have."""
+    if landmarks is None:
+        return None
+    both = (landmarks[i] >= 0) & (landmarks[j] >= 0)
+    return landmarks[i][both], landmarks[j][both]
 
 
 def _same_class(one: Alignment, matrix: np.ndarray, shift: np.ndarray, surface: Surface) -> bool:
