@@ -8,6 +8,7 @@ FOLDER holds the runs, such as those of ``nsm -m sweep=activation``.
 from __future__ import annotations
 
 import io
+import shutil
 import sys
 import tempfile
 import time
@@ -18,7 +19,7 @@ from selenium import webdriver
 from tensorboard import program
 
 PICTURE = Path(__file__).parent / "pictures" / "tensorboard.png"
-WIDTH, HEIGHT = 1500, 620
+WIDTH, HEIGHT = 2100, 700
 COLOURS = 64  # enough for a page of text, and the file is small
 
 
@@ -31,7 +32,9 @@ def main(folder: str) -> None:
         options.add_argument(f"--{word}")
     with tempfile.TemporaryDirectory() as profile:
         options.add_argument(f"--user-data-dir={profile}")
-        window = webdriver.Chrome(options=options)
+        options.binary_location = shutil.which("chromium") or ""
+        driver = webdriver.ChromeService(shutil.which("chromedriver"))
+        window = webdriver.Chrome(options=options, service=driver)
         try:
             window.get(f"{address}#hparams")
             time.sleep(30)  # TensorBoard reads the files; its page does not say when it is ready

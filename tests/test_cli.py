@@ -98,7 +98,9 @@ def test_a_mistake_is_one_line(here, arguments, named):
     assert len(result.stderr.splitlines()) == 1
 
 
-def test_ctrl_c_is_answered_whenever_it_comes(here, monkeypatch):
+def test_ctrl_c_is_answered_whenever_it_comes(here, tmp_path, monkeypatch):
+    (tmp_path / "patch.off").write_text(SQUARE)
+
     def stop(*_, **__):
         raise KeyboardInterrupt
 

@@ -197,6 +197,15 @@ def check_common_topology(
     """
     for name, (genus, loops) in zip(names, found, strict=True):
         if (genus, loops) != found[0]:
+            if genus == found[0][0] and 0 in (loops, found[0][1]):
+                open_, closed = (name, names[0]) if loops else (names[0], name)
+                raise NsmError(
+                    f"{open_} has a boundary and {closed} has none: maps take whole surfaces to "
+                    f"whole ones, not a part into a whole; close the holes of {open_}, or cut from "
+                    f"{closed} the part that corresponds",
+                    kind="wrong_topology",
+                    key=name,
+                )
             raise NsmError(
                 f"{name} has genus {genus} and {loops} boundary loops, {names[0]} genus "
                 f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes, as "

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.text import Text
 
 from nsm.data import SurfaceData
@@ -265,7 +266,7 @@ class PairMapTask(Task):
         write_correspondences(folder / "correspondences.npz", f)
         write_reliability(folder / "reliability.ply", f)
         reliability_picture(folder / "reliability.png", f)
-        _write_morph(folder, f)
+        _write_morph(folder, f, self.console)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
         if isinstance(f.target.map, AnalyticSurface):
@@ -273,7 +274,7 @@ class PairMapTask(Task):
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
 
 
-def _write_morph(folder: Path, f: SurfaceMap) -> None:
+def _write_morph(folder: Path, f: SurfaceMap, console: Console) -> None:
     """The path from the source to its image, with the vertices and faces of the source's file."""
     s = f.source.surface
     faces, corners = faces_of_file(s)
@@ -282,7 +283,10 @@ def _write_morph(folder: Path, f: SurfaceMap) -> None:
     for k in range(_MORPH_FRAMES):
         frame = f.morph(k / (_MORPH_FRAMES - 1))
         export_mesh(folder / "morph" / f"{k:02d}.obj", frame, faces, uv, corners=corners)
-    f.export_morph(folder / "morph.glb")
+    try:
+        f.export_morph(folder / "morph.glb")
+    except NsmError as error:  # of sizes that GLB has no numbers for
+        console.print(f"  left out: {error}")
 
 
 def _write_image(folder: Path, f: SurfaceMap) -> None:

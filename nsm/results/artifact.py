@@ -150,7 +150,7 @@ class NeuralSurface:
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
             message = f"count: {count!r} is not a whole number from 1 to {most}"
             raise NsmError(message, kind="out_of_range", key="count")
-        values, functions = spectrum(self.module(), s.uv, s.faces, count, joined=joined)
+        values, functions = spectrum(self.module().cpu(), s.uv, s.faces, count, joined=joined)
         return values, by_file_vertex(s, functions)
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -35,7 +35,9 @@ def write_morph_target(
 ) -> None:
     """Write a mesh that a slider, or the file's animation, moves to its image.
 
-    Positions are in single precision, as the format has it (glTF 2.0, 3.7.2.2, Morph Targets).
+    Positions are in single precision, as the format has it (glTF 2.0, 3.7.2.2, Morph Targets),
+    about the middle of the mesh, to which the file's node moves them: a mesh far from the origin
+    keeps its digits.
 
     Args:
         path: a .glb file.
@@ -45,18 +47,25 @@ def write_morph_target(
         name: of the target, as programs show it.
 
     Raises:
-        NsmError: ``unknown_format``: the file's ending is not .glb.
+        NsmError: ``unknown_format``: the file's ending is not .glb; ``out_of_range``: a length
+            exceeds single precision.
         OSError: the folder cannot be written.
     """
     target = Path(path)
     if target.suffix.lower() != ".glb":
         message = f"{target}: a mesh with a morph target is written as .glb"
         raise NsmError(message, kind="unknown_format", key=str(target))
-    start = vertices.astype("<f4")
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    with np.errstate(over="ignore"):
+        start = (vertices - middle).astype("<f4")
+        # what is added to the rounded start shall lead to the image
+        change = (image - middle - start).astype("<f4")
+    if not (np.isfinite(start).all() and np.isfinite(change).all()):
+        message = f"{target}: lengths exceed single precision; scale the meshes"
+        raise NsmError(message, kind="out_of_range", key=str(target))
     buffer = _Buffer()
     position = buffer.add(start, "VEC3", _VERTICES, bounds=True)
-    # what is added to the rounded start shall lead to the image
-    moved = buffer.add((image - start).astype("<f4"), "VEC3", _VERTICES, bounds=True)
+    moved = buffer.add(change, "VEC3", _VERTICES, bounds=True)
     corners = buffer.add(faces.astype("<u4").ravel(), "SCALAR", _FACES)
     times = buffer.add(np.array(_SECONDS, "<f4"), "SCALAR", bounds=True)
     weights = buffer.add(np.array(_WEIGHTS, "<f4"), "SCALAR")
@@ -75,7 +84,7 @@ def write_morph_target(
         "asset": {"version": "2.0", "generator": "nsm"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": target.stem}],
+        "nodes": [{"mesh": 0, "name": target.stem, "translation": middle.tolist()}],
         "meshes": [
             {"primitives": [primitive], "weights": [0.0], "extras": {"targetNames": [name]}}
         ],

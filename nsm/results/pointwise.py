@@ -149,28 +149,31 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
     start, end = (f.target, f.source) if back else (f.source, f.target)
     s, e = start.surface, end.surface
 
+    # Apple's GPUs have no double precision
+    kind = torch.float32 if points.device.type == "mps" else torch.float64
+
     def like(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float64, device=points.device)
+        return torch.as_tensor(array, dtype=kind, device=points.device)
 
     name = "points on the target" if back else "points on the source"
     check_points(points, name, columns=_AXES)
-    places = located(s, points.detach().double().cpu().numpy(), name)
+    places = located(s, points.detach().cpu().double().numpy(), name)
     corners = s.faces[places.face]
     if back:
-        laid_out, reached = like(s.uv[corners]), image(None).double().to(points.device)
+        laid_out, reached = like(s.uv[corners]), image(None).to(points.device, kind)
     else:
         used, number = np.unique(corners, return_inverse=True)
-        laid_out = image(used).double().to(points.device)[number.reshape(corners.shape)]
+        laid_out = image(used).to(points.device, kind)[number.reshape(corners.shape)]
         reached = like(e.uv)
     weights = like(places.weights)
-    uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().numpy()
-    found = e.domain.locate(uv, reached.detach().cpu().numpy(), e.faces)
+    uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().double().numpy()
+    found = e.domain.locate(uv, reached.detach().cpu().double().numpy(), e.faces)
     at, ends = like(found.weights), reached[e.faces[found.face]]
     near = (at[:, :, None] * ends).sum(dim=1).detach()
     begin, finish = like(s.vertices[corners]), like(e.vertices[e.faces[found.face]])
 
     def through(given: Tensor) -> Tensor:
-        p = (given.double() - like(s.center)) * s.scale
+        p = (given.to(kind) - like(s.center)) * s.scale
         uv = (_barycentric(p, begin, weights)[:, :, None] * laid_out).sum(dim=1)
         inside = _barycentric(e.domain.lift(uv, near), ends, at)
         result = (inside[:, :, None] * finish).sum(dim=1)

@@ -355,7 +355,8 @@ class SurfaceMap:
         their own files, in single precision; programs show the target as a shape key.
 
         Raises:
-            NsmError: ``unknown_format``: the file's ending is not .glb.
+            NsmError: ``unknown_format``: the file's ending is not .glb; ``out_of_range``: a length
+                exceeds single precision.
             OSError: the folder cannot be written.
         """
         write_morph(path, self)

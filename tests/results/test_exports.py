@@ -21,6 +21,7 @@ from nsm.results import (
     write_reliability,
 )
 from nsm.results.file_faces import faces_of_file
+from nsm.results.morph_target import write_morph_target
 from nsm.surfaces.gltf import check_gltf
 
 NEURAL, _, PAIR, _ = results(rings=5)
@@ -73,11 +74,12 @@ def test_a_morph_target_leads_from_the_source_to_the_target(cut, tmp_path):
     cut.export_morph(file)
     tree, arrays = read_glb(file)
     primitive = tree["meshes"][0]["primitives"][0]
-    start = arrays[primitive["attributes"]["POSITION"]]
+    middle = np.array(tree["nodes"][0]["translation"])
+    start = arrays[primitive["attributes"]["POSITION"]] + middle
     vertices, faces = cut.source.file_mesh()
     np.testing.assert_array_equal(arrays[primitive["indices"]].reshape(-1, 3), faces)
-    np.testing.assert_array_equal(start, vertices.astype("f4"))
-    end = start.astype(float) + arrays[primitive["targets"][0]["POSITION"]]
+    np.testing.assert_allclose(start, vertices, rtol=0, atol=1e-6)  # 100 from the origin
+    end = start + arrays[primitive["targets"][0]["POSITION"]]
     away = np.linalg.norm(end - [0, -5.0, 0], axis=1)
     assert 0.08 < away.min() <= away.max() < 0.1001  # on the small sphere, in its place
     assert tree["meshes"][0]["extras"]["targetNames"] == ["on ball 2"]
@@ -90,6 +92,9 @@ def test_a_morph_target_leads_from_the_source_to_the_target(cut, tmp_path):
     with pytest.raises(NsmError) as caught:
         cut.export_morph(tmp_path / "morph.obj")
     assert caught.value.kind == "unknown_format"
+    with pytest.raises(NsmError) as caught:
+        write_morph_target(file, vertices, 1e39 * vertices, faces, "too far")
+    assert caught.value.kind == "out_of_range"
 
 
 def test_the_gltf_validator_finds_nothing(cut, tmp_path):

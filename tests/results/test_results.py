@@ -33,8 +33,10 @@ from nsm.results import (
     reconstruction_image,
     save_surface,
 )
+from nsm.results.collection_pictures import cycle_picture
 from nsm.results.evolution import extend_strip
 from nsm.results.files import as_json
+from nsm.results.pair_pictures import normals_picture
 from nsm.results.pictures import neural_normals
 from nsm.results.render import View, rasterise, vertex_normals
 from nsm.results.spheres import Spheres
@@ -388,3 +390,12 @@ def test_the_normals_of_a_network_are_those_of_its_surface():
     assert np.allclose(neural_normals(phi, np.zeros((3, 2))), [0, -1, 0])
     flat = Affine([1, 0, 0], [1, 0, 0], [0, 0, 0])
     assert np.allclose(neural_normals(flat, np.zeros((1, 2))), 0)
+
+
+def test_pictures_of_normals_and_of_a_cycle_are_drawn(tmp_path):
+    made = results(6)
+    normals_picture(tmp_path / "normals.png", made.pair)
+    cycle_picture(tmp_path / "cycle.png", made.trio)
+    for name in ("normals.png", "cycle.png"):
+        picture = np.asarray(Image.open(tmp_path / name).convert("RGB"), dtype=float)
+        assert picture.std() > 20  # something is on it

@@ -14,6 +14,7 @@ from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
 from nsm.results.collection import load_collection
 from nsm.results.files import atomic_write
+from nsm.results.metrics import evaluate
 from nsm.results.pair_pictures import distorted
 from nsm.results.parameterization import load_parameterization
 from nsm.results.pictures import GREY, checked, fine, layout_image, panels, save_figure
@@ -119,7 +120,7 @@ def _overfit(folder: Path, trust: Sequence[str]) -> _Panels:
     surface = neural.surface
     view = View(surface.vertices, _SIDE)
     uv, faces = fine(surface)
-    vertices = neural(uv)
+    vertices = evaluate(neural.map, uv)
     normals = 0.5 * (vertex_normals(vertices, faces) @ view.frame.T + 1)
 
     def grey(blend: Blend) -> np.ndarray:
