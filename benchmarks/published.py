@@ -1,9 +1,10 @@
 """Whole trainings by the published recipe, each to its own stop, beside the default settings.
 
-Two animals are overfitted and mapped to each other on the disc, with experiment=paper and with the
-default. The published recipe takes days on a CPU, so that what is trained there is a reduced form,
-with narrower and fewer layers of φ and ψ and fewer steps, as ``FORMS`` says and the result's name
-states; --form full is for a GPU. It is measured when the default is done and where it stops itself.
+An animal is overfitted and mapped to another surface over the disc, with experiment=paper and with
+the default. The published recipe takes days on a CPU, so that what is trained there is a reduced
+form, with narrower and fewer layers of φ, fewer steps and a target in closed form, as ``FORMS``
+says and the result states; --form full is for a GPU. It is measured when the default is done and
+where it stops itself.
 
     python benchmarks/published.py --meshes FOLDER [--form full]
 
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from training import Clock, train
@@ -28,13 +30,15 @@ from training import Clock, train
 import nsm
 from nsm.config import compose_config
 from nsm.domains import Surface
+from nsm.maps.analytic import ANALYTIC
 from nsm.pipeline import built, make_task, quiet_lightning
-from nsm.results import NeuralSurface, atomic_write, overfit_metrics
+from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.results import NeuralSurface, analytic_surface, atomic_write, overfit_metrics
 from nsm.results.callbacks import GradientWatch
 from nsm.surfaces.cache import cache_folder
 
 RESULTS = Path(__file__).parent / "results"
-SOURCE, TARGET = "shrec07-384", "shrec07-388"
+SOURCE = "shrec07-384"
 
 
 @dataclass(frozen=True)
@@ -43,21 +47,24 @@ class Form:
 
     Attributes:
         label: of the tables.
+        target: of the map: a mesh, by the name of its file, or a surface in closed form.
         surface, pair: overrides beside experiment=paper.
     """
 
     label: str
+    target: str
     surface: tuple[str, ...] = ()
     pair: tuple[str, ...] = ()
 
 
 FORMS = {
-    "full": Form("published recipe"),
+    "full": Form("published recipe", "shrec07-388"),
     "reduced": Form(
-        "published recipe, reduced: φ and ψ of 4 blocks of 32 for 7,000 steps, h of 4 layers of "
-        "128 for 7,000 steps",
+        "published recipe, reduced: φ of 4 blocks of 32 for 7,000 steps, h of 4 layers of 128 for "
+        "2,000 steps, to a cap of the sphere",
+        "sphere_cap",
         ("map.width=32", "map.depth=4", "trainer.max_steps=7000"),
-        ("trainer.max_steps=7000",),
+        ("trainer.max_steps=2000",),
     ),
 }
 QUIET = ["logger=none", "artefacts=false", "trainer.progress=false", "domain=disc"]
@@ -140,51 +147,58 @@ def _norm(watch: GradientWatch, config: Any, surface: Surface) -> float:
     return samples * sum(watch.recent) / max(1, len(watch.recent))
 
 
-def overfitted(store: Store, name: str, meshes: Path, form: Form, folder: Path) -> NeuralSurface:
-    """A neural surface by the published recipe, and the figures of the default beside it."""
+def overfitted(store: Store, name: str, meshes: Path, form: Form, folder: Path) -> list[Any]:
+    """Neural surfaces of an animal by default and by the published recipe, and their figures."""
     surface = Surface.load(meshes / f"{name}.off", domain="disc")
+    places = [folder / f"{name}-default", folder / name]
 
     def figures(module: Any) -> dict[str, float]:
         return overfit_metrics(surface, module.map.eval())
 
-    if f"{name}/default" not in store:
+    def keep(place: Path, module: Any, metrics: dict[str, float]) -> None:
+        NeuralSurface(surface, module.map.eval().requires_grad_(False), metrics, {}).save(place)
+
+    if f"{name}/default" not in store or not places[0].exists():
         start = seconds()
-        _, module, _ = train(compose_config(["domain=disc"]), surface, [])
-        spent = seconds() - start
-        entry = {"seconds": spent, "steps": module.global_step, "metrics": figures(module)}
+        trainer, module, _ = train(compose_config(["domain=disc"]), surface, [])
+        spent, metrics = seconds() - start, figures(module)
+        keep(places[0], module, metrics)
+        entry = {"seconds": spent, "steps": trainer.global_step, "metrics": metrics}
         store.put(f"{name}/default", entry)
-    config = compose_config(["experiment=paper", *form.surface])
-    place = folder / name
-    if f"{name}/published" not in store or not place.exists():
+    if f"{name}/published" not in store or not places[1].exists():
         when = store.found[f"{name}/default"]["seconds"]
+        config = compose_config(["experiment=paper", *form.surface])
         module, early, stop = trained(config, (surface,), surface, when, figures)
+        keep(places[1], module, stop["metrics"])
         store.put(f"{name}/published, same time", early)
         store.put(f"{name}/published", stop)
-        network = module.map.eval().requires_grad_(False)
-        NeuralSurface(surface, network, stop["metrics"], {}).save(place)
-    phi: Any = nsm.load(place)
-    return phi
+    return [nsm.load(place) for place in places]
 
 
-def mapped(store: Store, phi: NeuralSurface, psi: NeuralSurface, meshes: Path, form: Form) -> None:
-    """The map by the published recipe, and by default, each before and after its training."""
-    files = [str(meshes / f"{name}.off") for name in (SOURCE, TARGET)]
-    marks = [str(meshes / "landmarks" / f"{name}.vts") for name in (SOURCE, TARGET)]
-    pair = f"{SOURCE} → {TARGET}"
-    # neural surfaces of the default, from the cache or into it
-    ready = nsm.map_pair(*files, marks, overrides=[*QUIET, "trainer.max_steps=1"], progress=False)
+def mapped(
+    store: Store, phis: list[Any], psis: list[Any], landmarks: list[np.ndarray], form: Form
+) -> None:
+    """The map by default and by the published recipe, the latter before and after its training.
+
+    Args:
+        store: where it is put.
+        phis, psis: neural surfaces of source and target, by default and by the recipe.
+        landmarks: vertices (L,) of both files.
+        form: of the recipe.
+    """
+    pair = f"{SOURCE} → {form.target}"
     if f"{pair}/default" not in store:
+        pairs = np.stack(landmarks, axis=1).tolist() or None
         start = seconds()
-        f = nsm.map_pair(ready.source, ready.target, ready.landmarks.tolist(), progress=False)
+        f = nsm.map_pair(phis[0], psis[0], pairs, progress=False)
         spent = seconds() - start
         steps = f.config["trainer"]["max_steps"]
         store.put(f"{pair}/default", {"seconds": spent, "steps": steps, "metrics": f.metrics})
     if f"{pair}/published" in store:
         return
     config = compose_config(["task=pair_map", "experiment=paper", *QUIET, *form.pair])
-    ids = list(ready.landmarks.T)
     task: Any = make_task(config, Console(quiet=True))
-    task.use(phi, psi, ids)
+    task.use(phis[1], psis[1], landmarks)
 
     def figures(module: Any) -> dict[str, float]:
         result = task.make_result(module)
@@ -193,7 +207,8 @@ def mapped(store: Store, phi: NeuralSurface, psi: NeuralSurface, meshes: Path, f
 
     store.put(f"{pair}/before", {"seconds": 0.0, "steps": 0, "metrics": figures(built(task))})
     when = store.found[f"{pair}/default"]["seconds"]
-    _, early, stop = trained(config, (phi, psi, ids), phi.surface, when, figures)
+    inputs = (phis[1], psis[1], landmarks)
+    _, early, stop = trained(config, inputs, phis[1].surface, when, figures)
     store.put(f"{pair}/published, same time", early)
     store.put(f"{pair}/published", stop)
 
@@ -218,11 +233,13 @@ def tables(file: Path) -> str:
     entries = {key: value for key, value in found.items() if "/" in key}
     parts = [f"{found['form']}. Seconds of {found['machine']}."]
     for columns in (COLUMNS, MAP_COLUMNS):
-        shown = {k: v for k, v in entries.items() if set(columns) <= set(v["metrics"])}
+        first = next(iter(columns))
+        shown = {k: v for k, v in entries.items() if first in v["metrics"]}
         lines = [f"| training | seconds | steps | {' | '.join(columns.values())} |"]
         lines.append("|---" * (3 + len(columns)) + "|")
         for key, entry in shown.items():
-            figures = " | ".join(f"{entry['metrics'][name]:.3f}" for name in columns)
+            told = [entry["metrics"].get(name) for name in columns]
+            figures = " | ".join("–" if one is None else f"{one:.3f}" for one in told)
             spent = f"{entry['seconds']:.0f} | {entry['steps']}"
             lines.append(f"| {key.replace('/', ', ')} | {spent} | {figures} |")
         parts.append("\n".join(lines))
@@ -241,8 +258,16 @@ def main() -> None:
     card = f"-{_machine().replace(' ', '-')}" if torch.cuda.is_available() else ""
     file = arguments.folder / f"published-{arguments.form}{card}.json"
     store, kept = Store(file, form), cache_folder() / "published" / file.stem
-    phi, psi = (overfitted(store, n, arguments.meshes, form, kept) for n in (SOURCE, TARGET))
-    mapped(store, phi, psi, arguments.meshes, form)
+    meshes = arguments.meshes
+    phis = overfitted(store, SOURCE, meshes, form, kept)
+    if form.target in ANALYTIC:
+        psis = [analytic_surface({"name": form.target}, "disc")] * 2
+        landmarks = [np.zeros(0, dtype=np.int64)] * 2
+    else:
+        psis = overfitted(store, form.target, meshes, form, kept)
+        marks = [str(meshes / "landmarks" / f"{name}.vts") for name in (SOURCE, form.target)]
+        landmarks = landmark_vertices(marks, [phis[1], psis[1]], Console(quiet=True))
+    mapped(store, phis, psis, landmarks, form)
     text = tables(file)
     file.with_suffix(".md").write_text(text)
     print(text)

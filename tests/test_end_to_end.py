@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import nsm
 
@@ -67,10 +68,13 @@ def test_the_run_folder_is_complete(finished):
         "reconstruction.glb",
         "error.png",
         "checkerboard.png",
+        "evolution.png",
         "metrics.json",
     ):
         assert (folder / name).stat().st_size > 0, name
     assert not list(folder.rglob("*.tmp"))
+    with Image.open(folder / "evolution.png") as strip:
+        assert strip.width % strip.height == 0 and strip.width >= 2 * strip.height
 
 
 def test_the_result_is_the_shape(finished):

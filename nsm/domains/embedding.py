@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 # slim_held: SLIM without the sliding steps, a fast estimate of slim
 METHODS = ("tutte", "slim_held", "slim")
+GIVEN = "given"  # texture coordinates of the mesh file (:mod:`nsm.domains.given_layout`)
 # meshes with more faces than LARGE are first decimated to COARSE faces
 LARGE, COARSE = 40_000, 12_000
 FEWER = 8  # a mesh whose Tutte embedding flips triangles is decimated by this factor, or again
@@ -143,8 +144,8 @@ def _is_injective(uv: np.ndarray, faces: np.ndarray, loop: np.ndarray) -> bool:
 
 
 def check_method(method: str, name: str) -> None:
-    """NsmError for a method that is none of :data:`METHODS`."""
-    if method not in METHODS:
+    """NsmError for a method that is none of :data:`METHODS`, nor ``given``."""
+    if method not in (*METHODS, GIVEN):
         raise NsmError(
             f"{name}: unknown parameterization {method!r}; use one of {', '.join(METHODS)}",
             kind="unknown_option",

@@ -62,19 +62,21 @@ class Placed(nn.Module):
         self.register_buffer("center", center.detach().to(like.device, kind))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, 2) to (N, n), in the type of x."""
-        return (self.inner(self._fit(x)) / self.scale + self.center).to(x.dtype)
+        """(N, 2) to (N, n), in the type and on the device of x."""
+        return self._placed(self.inner(self._fit(x))).to(x)
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, n) and Jacobians J_inner(x) / scale, (N, n, 2)."""
         value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self._fit(x))
-        value = value / self.scale + self.center
-        return value.to(x.dtype), (jacobian / self.scale).to(x.dtype)
+        return self._placed(value).to(x), (jacobian / self.scale).to(x)
+
+    def _placed(self, value: Tensor) -> Tensor:
+        return value / self.scale + self.center.to(value.device)  # closed forms follow x
 
     def _fit(self, x: Tensor) -> Tensor:
-        """x in the type of the network's weights."""
+        """x in the type and on the device of the network's weights."""
         weight = next(self.inner.parameters(), None)
-        return x if weight is None else x.to(weight.dtype)
+        return x if weight is None else x.to(weight)
 
 
 class Rotated(nn.Module):

@@ -205,6 +205,14 @@ class PlanarNetwork(NeuralMap):
 
     The spline has as many cells as the finest of ``encoding.resolutions``; the settings here, and
     the activation, are of the network alone. ``map=mlp`` takes the network on all domains.
+
+    Args:
+        out_dim: 2 for a planar map h.
+        width, depth: features of the hidden layers; number of blocks; with a boundary.
+        block: as for :class:`NeuralMap`; with a boundary.
+        activation, encoding: modules, as for :class:`NeuralMap`.
+        initialization: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
+        linear_skip: ``none`` or ``linear``: a linear function of the encoding's features is added.
     """
 
 

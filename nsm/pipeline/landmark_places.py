@@ -10,20 +10,21 @@ import numpy as np
 from rich.console import Console
 
 from nsm.domains.joint_preparation import Mesh
-from nsm.pipeline.resolve_inputs import Shape, landmark_lists
+from nsm.pipeline.landmark_inputs import landmark_lists, name_of
+from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.inserted_points import with_points
-from nsm.surfaces.landmarks import check_places, listed
+from nsm.surfaces.landmarks import MISSING, check_places, present
 
 
 def with_places(
-    landmarks: Any, shapes: Sequence[Shape], console: Console
+    landmarks: Any, shapes: Sequence[Shape], console: Console, *, template: bool = False
 ) -> tuple[list[Shape], Any, list[np.ndarray | None]]:
     """Shapes that have landmarks given as places in triangles for vertices, the last ones.
 
     Neural surfaces stay as they are: their places are those of the nearest vertices.
 
     Args:
-        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
+        landmarks, template: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them.
         shapes: two or more.
         console: where to say which vertices they are.
 
@@ -33,16 +34,18 @@ def with_places(
 
     Raises:
         NsmError: ``out_of_range`` or ``not_on_surface`` for a place that is not on its shape, or as
-            :func:`nsm.pipeline.resolve_inputs.landmark_vertices`.
+            :func:`nsm.pipeline.landmark_inputs.landmark_vertices`.
     """
     result, lists, every = list(shapes), [], []
-    for k, item in enumerate(landmark_lists(landmarks, len(shapes), console)):
+    names = [name_of(shape) for shape in shapes]
+    for k, given in enumerate(landmark_lists(landmarks, names, console, template=template)):
         shape, places = shapes[k], None
-        name = shape.name if isinstance(shape, Mesh) else shape.surface.name
-        given = listed(item, f"landmarks of {name}")
         if isinstance(given, np.ndarray) and given.shape[1] == 4 and isinstance(shape, Mesh):
-            check_places(given, shape.faces, shape.name)
-            vertices, faces, ids = with_points(shape.vertices, shape.faces, given)
+            there = np.flatnonzero(present(given))
+            check_places(given[there], shape.faces, shape.name, there)
+            vertices, faces, found = with_points(shape.vertices, shape.faces, given[there])
+            ids = np.full(len(given), MISSING)
+            ids[there] = found
             count = len(shape.vertices)
             result[k], places = replace(shape, vertices=vertices, faces=faces), given
             if len(vertices) > count:

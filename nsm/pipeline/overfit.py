@@ -25,6 +25,8 @@ from nsm.results import (
     overfit_metrics,
     reconstruction_image,
 )
+from nsm.results.meshes import ColouredMesh, painted
+from nsm.results.metrics import evaluate
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 
@@ -77,6 +79,10 @@ class OverfitTask(Task):
 
     def picture(self, module: Any) -> np.ndarray:
         return reconstruction_image(self.surface, module, size=384)
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        surface = self.surface
+        return painted(evaluate(module, surface.uv), surface.faces, surface.vertices)
 
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
         vertices = result(result.surface.uv)

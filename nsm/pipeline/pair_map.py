@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.text import Text
-from scipy.sparse import save_npz
 
 from nsm.data import SurfaceData
-from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.joint_preparation import matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
@@ -30,6 +30,7 @@ from nsm.results import (
     NeuralSurface,
     SurfaceMap,
     distortion_picture,
+    export_mesh,
     export_surface,
     isotopy_table,
     map_image,
@@ -37,12 +38,18 @@ from nsm.results import (
     morph_pictures,
     pair_metrics,
     pair_table,
+    reliability_picture,
     transfer_picture,
     warning_of_tears,
+    write_correspondences,
+    write_reliability,
 )
+from nsm.results.file_faces import faces_of_file
 from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
+from nsm.results.pair_pictures import normals_picture
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
     aligned,
@@ -96,6 +103,7 @@ class PairMapTask(Task):
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(source=phi, target=psi))
         refuse_other_topology([phi, psi])
+        ids = with_ends([phi.surface, psi.surface], ids)
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
@@ -117,6 +125,7 @@ class PairMapTask(Task):
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
         self.start = start = self._start(p, q)
+        q = self.domain.lift(q, start.before(p), target.lattice)
         phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
@@ -231,6 +240,10 @@ class PairMapTask(Task):
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
 
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.psi.surface.at(evaluate(module, self.surface.uv))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
         if self.proposed is not None:
@@ -250,14 +263,30 @@ class PairMapTask(Task):
         for name, mesh in meshes.items():
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
-        save_npz(folder / "source_to_target.npz", f.matrix())
-        (folder / "morph").mkdir(exist_ok=True)
-        for k in range(_MORPH_FRAMES):
-            frame = f.source.in_original_units(f.morph(k / (_MORPH_FRAMES - 1)))
-            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
+        write_correspondences(folder / "correspondences.npz", f)
+        write_reliability(folder / "reliability.ply", f)
+        reliability_picture(folder / "reliability.png", f)
+        _write_morph(folder, f, self.console)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
+        if isinstance(f.target.map, AnalyticSurface):
+            normals_picture(folder / "normals.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_morph(folder: Path, f: SurfaceMap, console: Console) -> None:
+    """The path from the source to its image, with the vertices and faces of the source's file."""
+    s = f.source.surface
+    faces, corners = faces_of_file(s)
+    uv = s.uv if s.domain.has_boundary else None
+    (folder / "morph").mkdir(exist_ok=True)
+    for k in range(_MORPH_FRAMES):
+        frame = f.morph(k / (_MORPH_FRAMES - 1))
+        export_mesh(folder / "morph" / f"{k:02d}.obj", frame, faces, uv, corners=corners)
+    try:
+        f.export_morph(folder / "morph.glb")
+    except NsmError as error:  # of sizes that GLB has no numbers for
+        console.print(f"  left out: {error}")
 
 
 def _write_image(folder: Path, f: SurfaceMap) -> None:

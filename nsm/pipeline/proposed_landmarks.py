@@ -16,8 +16,9 @@ from nsm.domains import DOMAINS, Domain
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.configured_surface import configured_repairs
+from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.pipeline.landmark_places import as_places, with_places
-from nsm.pipeline.resolve_inputs import Shape, landmark_vertices
+from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.landmark_files import to_json
 from nsm.surfaces.validation import CleanMesh, clean
 
@@ -98,6 +99,7 @@ def given_or_proposed(
     config: DictConfig,
     console: Console,
     exact: bool = True,
+    template: bool = False,
 ) -> tuple[list[Shape], list[np.ndarray], ProposedLandmarks | None]:
     """The landmarks of a map: those given, those proposed, or both.
 
@@ -106,13 +108,15 @@ def given_or_proposed(
     to them.
 
     Args:
-        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them, or ``auto``.
+        landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them, or
+            ``auto``.
         shapes: two or more.
         domain: of the map.
         config: of the run: its ``proposal`` and the decisions on meshes.
         console: where to say it.
         exact: landmarks that are places in triangles become vertices; else the nearest vertex
             stands for each.
+        template: as for :func:`nsm.pipeline.landmark_inputs.landmark_vertices`.
 
     Returns:
         the shapes, with these vertices; the landmarks as vertices (L,) of each; and the proposal if
@@ -122,7 +126,7 @@ def given_or_proposed(
         NsmError: ``wrong_type``: ``auto`` for a shape that is no mesh; ``unsure_landmarks``, with
             ``proposal.strict``; ``out_of_range``: fewer alternatives; or as
             :func:`nsm.correspondence.proposed` and
-            :func:`nsm.pipeline.resolve_inputs.landmark_vertices`.
+            :func:`nsm.pipeline.landmark_inputs.landmark_vertices`.
     """
     settings = config.proposal
     asked = isinstance(landmarks, str) and landmarks == AUTO
@@ -140,14 +144,16 @@ def given_or_proposed(
     known: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(shapes)
     if exact and not none:
         files = shapes
-        shapes, landmarks, places = with_places(landmarks, files, console)
+        shapes, landmarks, places = with_places(landmarks, files, console, template=template)
         known = [
             (file.faces, one) if isinstance(file, Mesh) and one is not None else None
             for file, one in zip(files, places, strict=True)
         ]
     meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
-    ids = landmark_vertices(landmarks, shapes, console)
-    few = settings.complete and 1 <= len(ids[0]) <= _COMPLETED
+    told = exact and not none
+    ids = landmark_vertices(landmarks, shapes, console, template=template, told=told)
+    some_lack = any((of_one < 0).any() for of_one in ids)
+    few = settings.complete and 1 <= len(ids[0]) <= _COMPLETED and not some_lack
     possible = len(meshes) == len(shapes) and domain == DOMAINS["orbifold"]
     if not (asked or (possible and (none or few))):
         return list(shapes), ids, None
@@ -208,6 +214,8 @@ def _proposal(
         np.stack([mesh.source_vertex[row] for mesh, row in zip(meshes, one.T, strict=True)], axis=1)
         for one in rows
     ]
+    # not in the middle of filled holes
+    numbers = [one[(one >= 0).all(axis=1)] for one in numbers]
     for one in numbers:  # a vertex that was merged with another keeps its number
         one[: len(ids[0])] = np.stack(ids, axis=1)
     return ProposedLandmarks(numbers, scores, margin, sure, len(ids[0]), alternative)

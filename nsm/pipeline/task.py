@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,6 +21,7 @@ from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
 from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
+from nsm.results.meshes import ColouredMesh
 from nsm.tasks.training import Training
 
 
@@ -33,15 +34,18 @@ class Given:
         phi: of task=param, a neural surface, or as ``surface``.
         source, target: of task=pair_map, as :func:`nsm.pipeline.resolve_inputs.read_shape` takes
             them.
-        surfaces: of task=collection_map, each the same.
-        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
+        surfaces: of task=collection_map, as :func:`nsm.pipeline.collection_inputs.collected` takes
+            them.
+        template: of task=collection_map, as ``source``.
+        landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them.
     """
 
     surface: Any = None
     phi: Any = None
     source: Any = None
     target: Any = None
-    surfaces: Sequence[Any] | None = None
+    surfaces: Any = None
+    template: Any = None
     landmarks: Any = None
 
 
@@ -198,6 +202,20 @@ class Task:
         """
         return False
 
+    def parts(self) -> list[Task]:
+        """Tasks of which this one consists, prepared, to be run one by one in folders of their own
+        (see :func:`nsm.pipeline.runner.run_parts`); none: it is trained itself."""
+        return []
+
+    def joined(self, results: list[Any]) -> Any:
+        """The result of a task that consists of parts, from theirs."""
+        raise NotImplementedError
+
+    def inner_line(self, result: Any) -> str:
+        """What is printed of a part of a task, after the surface's name; "" for a neural surface,
+        whose line the runner has."""
+        return ""
+
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""
         raise NotImplementedError
@@ -215,6 +233,10 @@ class Task:
 
     def picture(self, module: Any) -> np.ndarray | None:
         """A picture (H, W, 3) uint8 of the module as it stands, for the log; None: none."""
+        return None
+
+    def mesh(self, module: Any) -> ColouredMesh | None:
+        """The same as a mesh; None: none."""
         return None
 
     def save(self, folder: Path, result: Any) -> None:

@@ -14,12 +14,15 @@ from torch import Tensor, nn
 
 from nsm.domains import Surface, from_stored, stored
 from nsm.domains.surface import ARRAYS, OPTIONAL
+from nsm.energies import spectrum
+from nsm.errors import NsmError
 from nsm.maps import Placed
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, check_points
 from nsm.results.vertex_values import by_file_vertex
+from nsm.surfaces.holes import FIRST
 
 FORMAT = "nsm-surface"
 STEM = "surface"
@@ -124,18 +127,41 @@ class NeuralSurface:
             return s.raw
         return by_file_vertex(s, self.in_original_units(s.vertices)), s.file_faces()[0]
 
+    def spectrum(self, count: int = 10) -> tuple[np.ndarray, np.ndarray]:
+        """The smallest eigenvalues of the Laplace–Beltrami operator, and their functions.
+
+        See :func:`nsm.energies.spectrum`: functions are linear on the mesh's triangles of Ω, the
+        metric is that of φ, and a seam is joined.
+
+        Args:
+            count: how many, the constant function's λ = 0 among them.
+
+        Returns:
+            λ (count,), ascending, per square unit of the mesh file, and functions (W, count) at the
+            vertices of the mesh file.
+
+        Raises:
+            NsmError: ``out_of_range``: count is not from 1 to the number of vertices less one.
+        """
+        s = self.surface
+        vertex, inserted = s.source_vertex, s.source_vertex < 0
+        joined = np.where(inserted, len(s.cut_vertex) + np.arange(len(vertex)), vertex)
+        most = len(np.unique(joined)) - 1
+        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
+            message = f"count: {count!r} is not a whole number from 1 to {most}"
+            raise NsmError(message, kind="out_of_range", key="count")
+        values, functions = spectrum(self.module().cpu(), s.uv, s.faces, count, joined=joined)
+        return values, by_file_vertex(s, functions)
+
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """φ at the mesh's vertices: (V, 3) in the units of its file, faces (F, 3) and uv (V, 2).
 
         On a closed domain these are the vertices and faces of the mesh file, without copies, so
         that the mesh is closed; uv is then one lift of each vertex. Elsewhere they are those of the
-        cut mesh, ``surface``.
+        cut mesh, ``surface``. Filled holes are left out.
         """
-        surface = self.surface
-        if surface.domain.has_boundary:
-            return self(surface.uv), surface.faces, surface.uv
-        first, faces = surface.whole()
-        return self(surface.uv[first]), faces, surface.uv[first]
+        uv, (shown, faces) = self.surface.uv, self.surface.shown()
+        return self(uv[shown]), faces, uv[shown]
 
     def in_original_units(self, points: np.ndarray) -> np.ndarray:
         """Normalised points (N, 3) in the units and place of the mesh file.
@@ -235,11 +261,11 @@ def _check_arrays(surface: Surface) -> None:
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
     for name, array in surface.arrays().items():
-        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
+        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs", "ends")
         if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")
-    if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
-        raise ValueError("no faces, or source_vertex below -1")
+    if len(surface.faces) == 0 or surface.source_vertex.min() < FIRST - count:
+        raise ValueError("no faces, or more filled holes than vertices")
     cut = surface.cut_vertex
     if cut.ndim != 1 or not surface.source_vertex.max() < len(cut):
         raise ValueError("source_vertex names a vertex that the mesh file does not have")

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, overload
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
-from torch import Tensor, nn
+from torch import Tensor
 
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface
 from nsm.results.file_faces import FileFaces, same_mesh
-from nsm.results.points import as_points
+from nsm.results.files import atomic_write
+from nsm.results.points import as_points, as_values
+from nsm.results.pointwise import MapSequence
+from nsm.results.vertex_values import check_rows
 from nsm.surfaces.location import Places
 
 if TYPE_CHECKING:
@@ -86,9 +91,9 @@ class ComposedMap:
         """As :meth:`SurfaceMap.__matmul__`."""
         return composed(self, other)
 
-    def module(self) -> nn.Sequential:
+    def module(self) -> MapSequence:
         """The maps' modules (:meth:`SurfaceMap.module`), one after the other."""
-        return nn.Sequential(*(f.module() for f in self.maps))
+        return MapSequence(*(f.module() for f in self.maps))
 
     def to(self, device: torch.device | str) -> ComposedMap:
         """The same map with its networks on a device."""
@@ -105,14 +110,65 @@ class ComposedMap:
             places = there.to_file(f.places(here.to_surface(places), back=back))
         return places
 
+    def transfer(self, values: np.ndarray, *, back: bool = False) -> np.ndarray:
+        """As :meth:`SurfaceMap.transfer`."""
+        return transferred(self, values, back)
+
     def matrix(self) -> csr_matrix:
-        """The matrix (W, V) from values at the source's vertices to values at the target's, by
-        :meth:`correspondences`; arguments as of :meth:`SurfaceMap.matrix`."""
-        face, weights = self.correspondences(back=True)
-        faces = self.source.file_mesh()[1][face]
-        rows = np.repeat(np.arange(len(face)), 3)
-        shape = (len(face), len(self.source.surface.cut_vertex))
-        return csr_matrix((weights.ravel(), (rows, faces.ravel())), shape=shape)
+        """As :meth:`SurfaceMap.matrix`."""
+        return correspondence_matrix(self)
+
+
+def transferred(f: SurfaceMap | ComposedMap, values: np.ndarray, back: bool) -> np.ndarray:
+    """Values at the vertices of one file, interpolated at those of the other.
+
+    Raises:
+        NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
+    """
+    start = f.target if back else f.source
+    values = as_values(values, "values to transfer")
+    check_rows(start.surface, values)
+    faces = start.file_mesh()[1]
+    places = f.correspondences(back=not back)
+    if np.issubdtype(values.dtype, np.integer) or values.dtype == bool:
+        best = places.weights.argmax(axis=1)
+        return values[faces[places.face, best]]
+    return places.take(values, faces)
+
+
+def correspondence_matrix(f: SurfaceMap | ComposedMap) -> csr_matrix:
+    """The matrix (W, V) that interpolates values at the source's vertices at the points that the
+    target's correspond to."""
+    face, weights = f.correspondences(back=True)
+    columns = f.source.file_mesh()[1][face]
+    rows = np.repeat(np.arange(len(face)), 3)
+    shape = (len(face), len(f.source.surface.cut_vertex))
+    return csr_matrix((weights.ravel(), (rows, columns.ravel())), shape=shape)
+
+
+def write_correspondences(path: str | Path, f: SurfaceMap | ComposedMap) -> None:
+    """Write where the vertices of both mesh files go, as an .npz file.
+
+    ``source_to_target_vertices`` (W, 3) are the vertices of the target's file at the corners of the
+    face ``source_to_target_face`` (W,) that each vertex of the source's file goes to, and
+    ``source_to_target_barycentric`` (W, 3) their weights; ``target_to_source_...`` the same for
+    each vertex of the target's file.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    arrays: dict[str, Any] = {}
+    for name, end, back in (
+        ("source_to_target", f.target, False),
+        ("target_to_source", f.source, True),
+    ):
+        face, weights = f.correspondences(back=back)
+        arrays[f"{name}_face"] = face
+        arrays[f"{name}_vertices"] = end.file_mesh()[1][face]
+        arrays[f"{name}_barycentric"] = weights
+    data = io.BytesIO()
+    np.savez_compressed(data, **arrays)
+    atomic_write(path, data.getvalue())
 
 
 def composed(after: SurfaceMap | ComposedMap, before: SurfaceMap | ComposedMap) -> ComposedMap:

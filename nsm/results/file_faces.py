@@ -13,6 +13,7 @@ import numpy as np
 from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.surfaces.location import Places, locate
+from nsm.surfaces.topology import equal_faces
 
 if TYPE_CHECKING:
     from nsm.results.artifact import NeuralSurface
@@ -42,7 +43,7 @@ class FileFaces:
         # vertices of the file, with merged ones as the one they were merged with
         kept = np.where(row >= 0, surface.source_vertex[row], -1)
         there, here = kept[faces], surface.source_vertex[surface.faces]
-        file_face, surface_face = _matched(there, here)
+        file_face, surface_face = equal_faces(there, here)
         self._surface_face = np.full(len(faces), -1)
         self._surface_face[file_face] = surface_face
         self._file_face = np.full(len(here), -1)
@@ -123,22 +124,8 @@ def faces_of_file(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     given = surface.raw[1]
     row = surface.cut_vertex
     kept = np.where(row >= 0, surface.source_vertex[row], -1)[given]
-    file_face, own_face = _matched(kept, faces)
+    file_face, own_face = equal_faces(kept, faces)
     order = np.argsort(file_face, kind="stable")
     file_face, own_face = file_face[order], own_face[order]
     same = kept[file_face][:, :, None] == faces[own_face][:, None, :]
     return given[file_face], np.take_along_axis(corners[own_face], same.argmax(axis=2), axis=1)
-
-
-def _matched(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of (G, 3) and of (F, 3) with the same three numbers, none negative: pairs (M,), (M,)."""
-    rows = np.sort(np.concatenate([there, here]), axis=1)
-    _, number = np.unique(rows, axis=0, return_inverse=True)
-    number = number.reshape(-1)
-    usable = np.asarray((rows >= 0).all(axis=1))
-    first = np.full(number.max() + 1, -1)
-    mine = np.flatnonzero(usable[: len(there)])[::-1]  # the first of equal faces is taken
-    first[number[mine]] = mine
-    match = np.where(usable[len(there) :], first[number[len(there) :]], -1)
-    found = np.flatnonzero(match >= 0)
-    return match[found], found

@@ -46,17 +46,15 @@ def as_values(given: Any, name: str, *, kinds: str = "fiubc") -> np.ndarray:
     return values
 
 
-def check_points(given: Tensor, name: str, *, columns: int = 2, finite: bool = False) -> None:
+def check_points(given: Tensor, name: str, *, columns: int = 2) -> None:
     """Refuse a tensor that is not (N, columns) of floating point.
 
-    The values are not looked at without ``finite``: that would wait for the GPU.
+    The values are not looked at, which would wait for the GPU.
 
     Raises:
-        NsmError: ``wrong_shape`` or ``not_finite``, with the name as key.
+        NsmError: ``wrong_shape``, with the name as key.
     """
     if given.ndim != 2 or given.shape[1] != columns or not given.is_floating_point():
-        shape = tuple(given.shape)
-        message = f"{name}: give a tensor (N, {columns}) of floating point, not {given.dtype}"
-        raise NsmError(f"{message} {shape}", kind="wrong_shape", key=name)
-    if finite and not bool(given.isfinite().all()):
-        raise NsmError(f"{name}: it has NaN or infinity; remove them", kind="not_finite", key=name)
+        kind = f"{given.dtype} {tuple(given.shape)}"
+        message = f"{name}: give a tensor (N, {columns}) of floating point, not {kind}"
+        raise NsmError(message, kind="wrong_shape", key=name)

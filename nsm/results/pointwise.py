@@ -9,7 +9,7 @@ of the piece, and jumps between pieces.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from nsm.domains import Surface
 from nsm.results.certificate import Correction
-from nsm.results.points import check_points
+from nsm.results.points import as_points, check_points
 from nsm.surfaces.location import Places, locate
 
 if TYPE_CHECKING:
@@ -97,6 +97,19 @@ class SurfaceMapModule(nn.Module):
         return cast(Tensor, self.h(chosen)).to(like.device)
 
 
+class MapSequence(nn.Sequential):
+    """Modules of maps one after the other, as ``(g @ f).module()`` makes it."""
+
+    def value_and_jacobian(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`SurfaceMapModule.value_and_jacobian`, by the chain rule."""
+        first, *others = cast(Iterable[SurfaceMapModule], self)
+        value, jacobian = first.value_and_jacobian(points)
+        for f in others:
+            value, own = f.value_and_jacobian(value)
+            jacobian = own @ jacobian
+        return value, jacobian
+
+
 def fixed_image(f: SurfaceMap) -> Image:
     """Images of vertices as they are stored, without a gradient for the weights."""
     uv = torch.as_tensor(f.image_uv)
@@ -136,26 +149,31 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
     start, end = (f.target, f.source) if back else (f.source, f.target)
     s, e = start.surface, end.surface
 
-    def like(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float64, device=points.device)
+    # Apple's GPUs have no double precision
+    kind = torch.float32 if points.device.type == "mps" else torch.float64
 
-    places = _places(s, points, "points on the target" if back else "points on the source")
+    def like(array: np.ndarray) -> Tensor:
+        return torch.as_tensor(array, dtype=kind, device=points.device)
+
+    name = "points on the target" if back else "points on the source"
+    check_points(points, name, columns=_AXES)
+    places = located(s, points.detach().cpu().double().numpy(), name)
     corners = s.faces[places.face]
     if back:
-        laid_out, reached = like(s.uv[corners]), image(None).double().to(points.device)
+        laid_out, reached = like(s.uv[corners]), image(None).to(points.device, kind)
     else:
         used, number = np.unique(corners, return_inverse=True)
-        laid_out = image(used).double().to(points.device)[number.reshape(corners.shape)]
+        laid_out = image(used).to(points.device, kind)[number.reshape(corners.shape)]
         reached = like(e.uv)
     weights = like(places.weights)
-    uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().numpy()
-    found = e.domain.locate(uv, reached.detach().cpu().numpy(), e.faces)
+    uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().double().numpy()
+    found = e.domain.locate(uv, reached.detach().cpu().double().numpy(), e.faces)
     at, ends = like(found.weights), reached[e.faces[found.face]]
     near = (at[:, :, None] * ends).sum(dim=1).detach()
     begin, finish = like(s.vertices[corners]), like(e.vertices[e.faces[found.face]])
 
     def through(given: Tensor) -> Tensor:
-        p = (given.double() - like(s.center)) * s.scale
+        p = (given.to(kind) - like(s.center)) * s.scale
         uv = (_barycentric(p, begin, weights)[:, :, None] * laid_out).sum(dim=1)
         inside = _barycentric(e.domain.lift(uv, near), ends, at)
         result = (inside[:, :, None] * finish).sum(dim=1)
@@ -164,11 +182,15 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
     return through
 
 
-def _places(surface: Surface, points: Tensor, name: str) -> Places:
-    """Where points (N, 3), in the units of its file, are on a surface's mesh."""
-    check_points(points, name, columns=_AXES, finite=True)
+def located(surface: Surface, points: np.ndarray, name: str) -> Places:
+    """Where points (N, 3), in the units of its file, are on a surface's mesh.
+
+    Raises:
+        NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
+    """
+    points = as_points(points, 3, name)
     with np.errstate(over="ignore"):  # of points far away
-        normalised = (points.detach().double().cpu().numpy() - surface.center) * surface.scale
+        normalised = (points - surface.center) * surface.scale
     return locate(normalised, surface.vertices, surface.faces)
 
 

@@ -15,21 +15,21 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 
-from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired, statement
-from nsm.results.composed_map import ComposedMap, composed
+from nsm.results.composed_map import ComposedMap, composed, correspondence_matrix, transferred
 from nsm.results.file_faces import FileFaces
 from nsm.results.files import write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.points import as_points, as_values
-from nsm.results.pointwise import SurfaceMapModule, fixed_image, moved, value_and_jacobian
-from nsm.results.textured_mesh import LARGEST_SIZE, TexturedMesh, painted, read_file_mesh
-from nsm.results.vertex_values import by_file_vertex, cut_mesh_matrix, on_cut_mesh
+from nsm.results.morph_target import write_morph
+from nsm.results.points import as_points
+from nsm.results.pointwise import SurfaceMapModule, fixed_image, located, moved, value_and_jacobian
+from nsm.results.reliability import Reliability, reliability
+from nsm.results.textured_mesh import TexturedMesh, painted_by
+from nsm.results.vertex_values import by_file_vertex
 from nsm.results.welding import Weld, weld
-from nsm.surfaces.location import Places, locate
-from nsm.surfaces.textures import read_texture
+from nsm.surfaces.location import Places
 
 FORMAT = "nsm-surface-map"
 STEM = "pair"
@@ -79,7 +79,7 @@ class SurfaceMap:
         if isinstance(points, Tensor):
             return moved(self, points, fixed_image(self))
         s, t = self.source.surface, self.target.surface
-        image = _located(s, points, "points on the source").take(self.image_uv, s.faces)
+        image = located(s, points, "points on the source").take(self.image_uv, s.faces)
         return self.target.in_original_units(t.at(image))
 
     @overload
@@ -97,7 +97,7 @@ class SurfaceMap:
         if isinstance(points, Tensor):
             return moved(self, points, fixed_image(self), back=True)
         s, t = self.source.surface, self.target.surface
-        uv = _located(t, points, "points on the target").take(t.uv, t.faces)
+        uv = located(t, points, "points on the target").take(t.uv, t.faces)
         preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
         return self.source.in_original_units(s.at(preimage))
 
@@ -158,7 +158,17 @@ class SurfaceMap:
             face (W,), the rows of ``target.file_mesh()``'s faces, and barycentric coordinates
             (W, 3) in them: ``face, weights = f.correspondences()``.
         """
-        end = self.source if back else self.target
+        return self._corresponding_back if back else self._corresponding
+
+    @cached_property
+    def _corresponding(self) -> Places:
+        return self._on_file_faces(self.target, back=False)
+
+    @cached_property
+    def _corresponding_back(self) -> Places:
+        return self._on_file_faces(self.source, back=True)
+
+    def _on_file_faces(self, end: NeuralSurface, back: bool) -> Places:
         files = FileFaces(end.surface, *end.file_mesh(), end.surface.name)
         return files.to_file(self._of_file_vertices(back))
 
@@ -169,7 +179,7 @@ class SurfaceMap:
         absent = np.flatnonzero(start.surface.cut_vertex < 0)
         if len(absent):
             points = start.file_mesh()[0][absent]
-            near = self.places(_located(start.surface, points, "vertices"), back=back)
+            near = self.places(located(start.surface, points, "vertices"), back=back)
             face[absent], weights[absent] = near
         return Places(face, weights)
 
@@ -275,22 +285,13 @@ class SurfaceMap:
             back: from the target to the source.
 
         Returns:
-            (W, ...) a row for each vertex of the other mesh file (see :func:`by_file_vertex`).
+            (W, ...) a row for each vertex of the other mesh file, interpolated where
+            :meth:`correspondences` says.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
-        start, end = self.source.surface, self.target.surface
-        places = self._back
-        if back:
-            start, end, places = end, start, self._forth
-        inner = on_cut_mesh(start, as_values(values, "values to transfer"))
-        if np.issubdtype(inner.dtype, np.integer) or inner.dtype == bool:
-            best = places.weights.argmax(axis=1)
-            moved = inner[start.faces[places.face, best]]
-        else:
-            moved = places.take(inner, start.faces)
-        return by_file_vertex(end, moved)
+        return transferred(self, values, back)
 
     def bake(
         self,
@@ -317,13 +318,7 @@ class SurfaceMap:
             NsmError: ``missing_uv``, ``missing_texture`` or ``missing_file`` of the mesh that the
                 texture is on; ``wrong_mesh`` for other meshes than the map's; ``out_of_range``.
         """
-        if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= LARGEST_SIZE:
-            message = f"size: {size!r} is not a whole number from 1 to {LARGEST_SIZE}"
-            raise NsmError(message, kind="out_of_range", key="size")
-        ends = [target, source] if back else [source, target]
-        paint = read_texture(ends[0], texture)
-        start, end = (read_file_mesh(one) for one in ends)
-        return painted(self, start, paint, end, back=back, size=size)
+        return painted_by(self, source, target, texture=texture, back=back, size=size)
 
     def matrix(self) -> csr_matrix:
         """The matrix (W, V) that :meth:`transfer` applies to values at the source's vertices.
@@ -331,19 +326,18 @@ class SurfaceMap:
         Rows belong to vertices of the target's mesh file, columns to those of the source's. Rows
         have a sum of one and no negative entries.
         """
-        s, t = self.source.surface, self.target.surface
-        ids = np.arange(len(t.vertices))
-        columns = s.faces[self._back.face]
-        blend = csr_matrix(
-            (self._back.weights.ravel(), (np.repeat(ids, 3), columns.ravel())),
-            shape=(len(ids), len(s.vertices)),
-        )
-        return csr_matrix(blend[by_file_vertex(t, ids)] @ cut_mesh_matrix(s))
+        return correspondence_matrix(self)
+
+    @cached_property
+    def reliability(self) -> Reliability:
+        """Figures at the vertices of the source's file that say where to trust the map."""
+        return reliability(self)
 
     def morph(self, t: float) -> np.ndarray:
-        """Vertices (V, 3) on straight lines from the source (t = 0) to the target (t = 1).
+        """Vertices (W, 3) on straight lines from the source (t = 0) to its image (t = 1).
 
-        In normalised units; a rigid motion first aligns the target with the source.
+        They are those of the source's file, in its units; the image is scaled to the source's area
+        and aligned with it by a rigid motion. :meth:`export_morph` leaves it in its place.
 
         Raises:
             NsmError: ``wrong_type``: t is not a finite number.
@@ -351,7 +345,21 @@ class SurfaceMap:
         if not isinstance(t, Real) or not math.isfinite(t):
             message = f"morph: {t!r} is not a number from 0 to 1"
             raise NsmError(message, kind="wrong_type", key="t")
-        return (1 - t) * self.source.surface.vertices + t * self.aligned_image
+        end = self.source.in_original_units(self.aligned(self.welded_image))
+        return (1 - t) * self.source.file_mesh()[0] + t * end
+
+    def export_morph(self, path: str | Path) -> None:
+        """Write a GLB file: the source's mesh, with its image on the target as morph target.
+
+        Vertices and faces are those of the source's file. Both shapes have the units and place of
+        their own files, in single precision; programs show the target as a shape key.
+
+        Raises:
+            NsmError: ``unknown_format``: the file's ending is not .glb; ``out_of_range``: a length
+                exceeds single precision.
+            OSError: the folder cannot be written.
+        """
+        write_morph(path, self)
 
     @cached_property
     def aligned_image(self) -> np.ndarray:
@@ -388,11 +396,3 @@ class SurfaceMap:
             "config": self.config,
         }
         write_pair(place / STEM, FORMAT, tensors, metadata)
-
-
-def _located(surface: Surface, points: np.ndarray, what: str) -> Places:
-    """The places on a surface's mesh nearest to points (N, 3) in the units of its file."""
-    points = as_points(points, 3, what)
-    with np.errstate(over="ignore"):  # of points far away
-        normalised = (points - surface.center) * surface.scale
-    return locate(normalised, surface.vertices, surface.faces)

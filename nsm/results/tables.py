@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
@@ -33,10 +33,9 @@ def metrics_table(metrics: Mapping[str, float]) -> Table:
 
 _MAP_COLUMNS = {
     "symmetric_dirichlet_median": "D_iso, median",
-    "symmetric_dirichlet_p95": "95th percentile",
+    "symmetric_dirichlet_p95": "95th per- centile",
     "conformal_median": "D_conf, median",
     "singular_value_ratio_median": "σ₁/σ₂, median",
-    "area_median": "area, median",
     "flipped_before_repair_percent": "flipped % before repair",
     "flipped_percent": "after",
     "boundary_self_intersections": "overlaps",
@@ -50,10 +49,7 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
 
     D_iso is symmetric Dirichlet (METHOD, Eq. 2), D_conf the conformal energy (Eq. 3).
     """
-    table = Table("map", padding=(0, 1, 0, 0))  # headings fit a terminal of 80 columns
-    table.columns[0].no_wrap = True
-    for heading in _MAP_COLUMNS.values():
-        table.add_column(heading, width=max(map(len, heading.split())))
+    table = _narrow("map", _MAP_COLUMNS.values())
     for name, figures in metrics.items():
         shown = (_shown(figures, key, "")[0] for key in _MAP_COLUMNS)
         table.add_row(_METHODS.get(name, name), *shown)
@@ -120,28 +116,40 @@ def isotopy_table(found: Sequence[Alignment]) -> Table:
 
 
 _COLLECTION_COLUMNS = {
-    "start_symmetric_dirichlet_median": "symmetric Dirichlet, median before",
-    "symmetric_dirichlet_median": "after optimization",
-    "symmetric_dirichlet_p95": "95th percentile",
+    "start_symmetric_dirichlet_median": "median at start",
+    "symmetric_dirichlet_median": "median at end",
+    "symmetric_dirichlet_p95": "95th per- centile",
     "flipped_before_repair_percent": "flipped % before repair",
     "flipped_percent": "after",
     "outside_percent": "outside %",
-    "landmark_error_max_percent": "landmark error, largest %",
+    "landmark_error_max_percent": "marks off, most %",
     "seam_gap_mean_percent": "seam gap, mean %",
 }
 
 
 def collection_table(metrics: Mapping[str, Any]) -> Table:
-    """The figures of :func:`nsm.results.collection_metrics`, a row for each ordered pair."""
+    """The figures of :func:`nsm.results.collection_metrics`, a row for each ordered pair; medians
+    are of symmetric Dirichlet."""
     every = {key for figures in metrics["pairs"].values() for key in figures}
     columns = {key: label for key, label in _COLLECTION_COLUMNS.items() if key in every}
-    table = Table("pair", *columns.values())
-    table.columns[0].no_wrap = True
+    table = _narrow("pair", columns.values())
     for name, figures in metrics["pairs"].items():
         shown = (_shown(figures, key, "")[0] for key in columns)
         table.add_row(name, *shown)
     cycle = [metrics[f"cycle_error_{key}_percent"] for key in ("mean", "max")]
-    table.caption = f"cycle error: mean {cycle[0]:.2g} %, maximum {cycle[1]:.2g} % of the diagonal"
+    table.caption = (
+        f"symmetric Dirichlet, {LEAST_SYMMETRIC_DIRICHLET} at best; cycle error: mean "
+        f"{cycle[0]:.2g} %, maximum {cycle[1]:.2g} % of the diagonal"
+    )
+    return table
+
+
+def _narrow(first: str, headings: Iterable[str]) -> Table:
+    """A table whose headings break between words, to fit a terminal of 80 columns."""
+    table = Table(first, padding=(0, 1, 0, 0))
+    table.columns[0].no_wrap = True
+    for heading in headings:
+        table.add_column(heading, width=max(map(len, heading.split())))
     return table
 
 

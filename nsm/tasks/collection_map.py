@@ -39,13 +39,14 @@ class CollectionMap(ConstrainedMap):
         max_steps, domain, energy, loss_weights, constraints, loss_terms: see
             :class:`nsm.tasks.constrained.ConstrainedMap`.
         points: (K, 2) landmarks in the common domain.
-        targets: (k, K, 2) the same in each surface's own.
+        targets: (k, K, 2) the same in each surface's own; NaN where a surface lacks the landmark.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
         starts: where each h_i starts, a rotation or, on a closed domain, an affine map: maps around
             the identity.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
+        names: of the surfaces, each its own, for the curves ``pairs/A_to_B``; None: their numbers.
 
     Raises:
         ValueError: a constraint that is not known.
@@ -74,9 +75,10 @@ class CollectionMap(ConstrainedMap):
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh"]
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh", "names"]
         self.save_hyperparameters(ignore=given, logger=False)
         onto = domain if self.exact else None
         self.map = nn.ModuleList(
@@ -92,6 +94,9 @@ class CollectionMap(ConstrainedMap):
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
+        names = names or [str(k) for k in range(len(phis))]
+        both = zip(*(part.tolist() for part in self.ordered), strict=True)
+        self.pair_names = [f"pairs/{names[a]}_to_{names[b]}" for a, b in both]
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (N, 2) of the common domain to those of all surfaces, (k, N, 2)."""
@@ -178,7 +183,10 @@ class CollectionMap(ConstrainedMap):
         return torch.stack([barrier(h, self.global_step) for h, barrier in both]).sum()
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
-        self.log_validation(*self._evaluated(batch))
+        distortion, evaluation = self._evaluated(batch)
+        self.log_validation(distortion, evaluation)
+        of_pairs = dict(zip(self.pair_names, distortion.means.unbind(), strict=True))
+        self.log_figures(of_pairs, batch_size=len(batch))
 
     def flipped_percent(self) -> Tensor:
         both = zip(self.map, self.fold_barrier, strict=True)
@@ -187,4 +195,5 @@ class CollectionMap(ConstrainedMap):
     def landmark_error(self) -> Tensor:
         phis = batched(list(self.phis))
         units = self.targets.new_tensor(self.diagonals)[:, None]
-        return 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
+        every = 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
+        return every[self.there]

@@ -1,5 +1,6 @@
 """Maps between surfaces, as users run them: from meshes, ready surfaces, in Python, resumed."""
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -8,19 +9,23 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from rich.console import Console
 from tensor_checks import check_correspondences, check_tensors, check_weights
 
 import nsm
 from nsm.config import compose_config
+from nsm.domains import Square
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
-from nsm.pipeline import Given, run_task
-from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.pipeline import Given, built, make_task, run_task
+from nsm.pipeline.landmark_inputs import landmark_vertices
+from nsm.results import analytic_surface
 from nsm.results.metrics import evaluate
 from nsm.results.textured_mesh import TexturedMesh
 from nsm.surfaces.atlas import unwrapped
 from nsm.surfaces.geometry import point_mesh_distance
 from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.shapes import grid_mesh
 from nsm.surfaces.textures import read_texture
 
 QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
@@ -97,6 +102,10 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         "morph.png",
         "morph.gif",
         "morph/08.obj",
+        "morph.glb",
+        "correspondences.npz",
+        "reliability.ply",
+        "reliability.png",
     ):
         assert (folder / name).stat().st_size > 0, name
 
@@ -218,10 +227,11 @@ def test_a_file_with_copies_of_vertices_in_other_units(made, files, tmp_path):
 
 def test_a_morph_begins_at_the_source_and_ends_at_the_image(made):
     _, f = made
-    assert (f.morph(0.0) == f.source.surface.vertices).all()
-    end, image = f.morph(1.0), f.image
+    vertices, faces = f.source.file_mesh()
+    assert (f.morph(0.0) == vertices).all()
+    end, image = f.morph(1.0), f.welded_image / f.source.surface.scale
     # a rigid motion keeps all distances
-    edges = f.source.surface.faces[:, :2]
+    edges = faces[:, :2]
     lengths = [np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (end, image)]
     assert np.abs(lengths[0] - lengths[1]).max() < 1e-9
 
@@ -310,6 +320,21 @@ def on_the_square():
     )
 
 
+def test_the_corners_of_the_square_are_key_points_of_a_collection(monkeypatch):
+    monkeypatch.setattr(Square, "mesh", lambda self, rings=12: grid_mesh(8))
+    config = compose_config(["task=collection_map", "experiment=paper", "domain=square"])
+    task = make_task(config, Console(quiet=True))
+    shapes = [analytic_surface({"name": n}, Square()) for n in ("plane", "saddle", "paraboloid")]
+    task.use(shapes, [np.zeros(0, dtype=np.int64)] * 3)
+    module = built(task)
+    corners = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    assert sorted(module.points.tolist()) == sorted(corners.tolist())
+    for k, targets in enumerate(module.targets):
+        assert sorted(targets.round(decimals=5).tolist()) == sorted(corners.tolist())
+        # h_k starts as a turn of the square by quarters
+        torch.testing.assert_close(module.map[k](module.points), targets, atol=1e-5, rtol=0)
+
+
 def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
     count = len(nsm.Surface.load("hemisphere").vertices)
     np.save(tmp_path / "heat.npy", np.linspace(0, 1, count))
@@ -351,12 +376,29 @@ def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")
-def trio():
+def folder_of_trio(tmp_path_factory):
+    return tmp_path_factory.mktemp("trio")
+
+
+@pytest.fixture(scope="module")
+def trio(folder_of_trio):
     return nsm.map_collection(
         ["hemisphere", "saddle", "cone"],
-        overrides=[*QUICK, MADE, "trainer.max_steps=150"],
+        overrides=[*QUICK, MADE, "trainer.max_steps=150", "logger=csv", "artefacts=false"],
+        folder=folder_of_trio,
         progress=False,
     )
+
+
+def test_each_pair_of_a_collection_has_a_curve(trio, folder_of_trio):
+    with (folder_of_trio / "csv" / "metrics.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["val/distortion"]]
+    assert len(rows) == 3
+    names = [f"pairs/{name.replace(' → ', '_to_')}" for name in trio.metrics["pairs"]]
+    assert sorted(names) == sorted(name for name in rows[0] if name.startswith("pairs/"))
+    for row in rows:
+        mean = np.mean([float(row[name]) for name in names])
+        assert mean == pytest.approx(float(row["val/distortion"]), rel=1e-5)
 
 
 def test_a_collection_maps_every_surface_to_every_other(trio):

@@ -1,5 +1,7 @@
 """Maps on tensors, composed, and as correspondences: on domes over the disc, without training."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,9 @@ from tiny import planar, results
 import nsm
 from nsm.errors import NsmError
 from nsm.maps import Placed, Rotated
+from nsm.pipeline.resolve_inputs import read_shape
 from nsm.results import SurfaceMap, analytic_surface
+from nsm.results.file_faces import same_mesh
 
 NEURAL, _, PAIR, TRIO = results(rings=6)
 ANALYTIC = SurfaceMap(
@@ -93,3 +97,16 @@ def test_the_mesh_of_the_file_is_kept(tmp_path):
     for one in (phi, nsm.load(tmp_path)):
         for array, expected in zip(one.file_mesh(), given, strict=True):
             assert np.array_equal(array, expected)
+    # what a run left is prepared again as the mesh was
+    shape = read_shape(nsm.load(tmp_path).surface, surface.domain, "source")
+    assert np.array_equal(shape.vertices, given[0]) and np.array_equal(shape.faces, given[1])
+    with pytest.raises(NsmError) as caught:
+        read_shape(replace(surface, raw=None), surface.domain, "source")
+    assert caught.value.kind == "wrong_type" and caught.value.key == "source"
+    # an older version's surface has the faces in another order
+    older = nsm.NeuralSurface(replace(surface, raw=None), NEURAL[0].map)
+    vertices, faces = older.file_mesh()
+    np.testing.assert_allclose(vertices, given[0], atol=1e-12)
+    rows = [np.sort(np.sort(f, axis=1), axis=0).tolist() for f in (faces, given[1])]
+    assert rows[0] == rows[1]
+    assert same_mesh(older, phi) and not same_mesh(older, NEURAL[0])
