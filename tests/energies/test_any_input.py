@@ -89,8 +89,8 @@ OF_MAPS = {
 }  # fmt: skip
 # tested elsewhere: they use the above, or give no values of energies
 OTHER = {
-    "ENERGIES", "At", "Blend", "Curvatures", "Energy", "spectrum", "Invariants", "call_energy", "inside",
-    "pullback_invariants", "rotation", *(kind.__name__ for kind in ENERGIES.values()),
+    "ENERGIES", "At", "Blend", "Curvatures", "Energy", "Invariants", "call_energy", "inside",
+    "pullback_invariants", "rotation", "spectrum", *(kind.__name__ for kind in ENERGIES.values()),
 }  # fmt: skip
 
 
