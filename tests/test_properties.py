@@ -659,6 +659,7 @@ def test_closed_surfaces_of_any_radii(radii, scale):
     surface = Surface.from_arrays(vertices, faces, domain="orbifold")
     first, whole = surface.whole()
     assert np.array_equal(whole, faces)
+    assert all(np.array_equal(*pair) for pair in zip(surface.shown(), (first, whole), strict=True))
     own, corners = surface.file_faces()
     assert np.array_equal(own, faces) and np.array_equal(surface.source_vertex[corners], faces)
     kept = NeuralSurface(surface, NEURAL[0].map).file_mesh()
@@ -727,6 +728,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "Surface.arrays": [test_closed_surfaces_of_any_radii],
     "Surface.from_closed": [test_closed_surfaces_of_any_radii],
     "Surface.file_faces": [test_closed_surfaces_of_any_radii],
+    "Surface.shown": [test_closed_surfaces_of_any_radii],
     "Surface.whole": [test_closed_surfaces_of_any_radii],
     "Surface.from_arrays": [test_surfaces_of_any_arrays, test_surfaces_of_any_few_triangles],
     "Surface.from_cut": [test_surfaces_of_any_few_triangles],
