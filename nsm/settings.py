@@ -383,10 +383,13 @@ class ParamConstraints(Checked):
         boundary: free; or fixed: h keeps to the domain by construction and its boundary slides,
             so that the map is bijective.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
+        injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
+            areas at samples that are near to it, for quasi-Newton steps.
     """
 
     boundary: Literal["free", "fixed"]
     fold_every: Count = 25
+    injectivity: Literal["exponential", "smooth"] = "exponential"
 
 
 @dataclass(frozen=True)
@@ -398,19 +401,25 @@ class PairConstraints(Checked):
             the boundary to ∂Ω.
         landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
         multiplier_every: steps between two updates of the multipliers.
-        ramp: share of the steps over which the weights of landmarks and seam rise to their values.
+        ramp: share of the steps over which landmarks and the seam come into full effect.
+        ramp_of: what the ramp moves of the landmarks: targets, from where h has them at its start;
+            or weights: λ_C grows from a thousandth.
         fold_margin: what the determinant of J_h must stay above at the mesh triangles.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         multipliers_from: share of the steps before the multipliers' first update.
+        injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
+            areas at samples that are near to it, for quasi-Newton steps.
     """
 
     boundary: Literal["exact", "penalty"]
     landmarks: Literal["augmented", "fixed"]
     ramp: Share
+    ramp_of: Literal["targets", "weights"] = "targets"
     multiplier_every: Count = 50
     fold_margin: Share = 0.1
     fold_every: Count = 25
     multipliers_from: Share = 0.0
+    injectivity: Literal["exponential", "smooth"] = "exponential"
 
 
 @dataclass

@@ -10,11 +10,12 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import unfold
+from nsm.energies import injectivity, unfold
 
 _COUNT = 256
 # triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
 _LOOK = 16_384
+_SMALL = 0.02  # ratio of areas where the smooth term begins
 
 
 class FoldBarrier(nn.Module):
@@ -99,6 +100,29 @@ def _double_areas(corners: Tensor) -> Tensor:
     a, b, c = corners.unbind(dim=1)
     u, v = b - a, c - a
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+
+
+def folds(kind: str, determinant: Tensor, source: Tensor, target: Tensor) -> Tensor:
+    """How much h folds at points: G of METHOD, or a smooth term in its place.
+
+    The smooth one takes the ratio of the areas of target and source with the sign of det J_h: it
+    begins at a small positive ratio, before h folds, so that a line search is not stopped by a
+    single point.
+
+    Args:
+        kind: exponential, or smooth.
+        determinant: det J_h (N,).
+        source, target: metrics A and B (N, 2, 2).
+
+    Returns:
+        (N,).
+    """
+    if kind == "exponential":
+        return injectivity(determinant)
+    with torch.no_grad():
+        areas = torch.linalg.det(target.double()) / torch.linalg.det(source.double()).clamp(1e-24)
+        scale = areas.clamp(min=0).sqrt() / determinant.double().abs().clamp(min=1e-12)
+    return unfold(determinant * scale.to(determinant), _SMALL)
 
 
 Weights = TypeVar("Weights")

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
+from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
@@ -80,10 +81,11 @@ class PairMap(ConstrainedMap):
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        self.batch = batch
         w, ramp = self.loss_weights, self.ramp
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
-        G = injectivity(evaluation.determinant).mean()
+        G = self.folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
@@ -96,7 +98,7 @@ class PairMap(ConstrainedMap):
             + w.boundary * B
             + ramp * w.seam * S
             + w.triangles * U
-            + w.landmarks * C
+            + self.landmark_weight * C
         )
         terms: dict[str, Term] = {
             **distortion.terms,
@@ -105,7 +107,7 @@ class PairMap(ConstrainedMap):
             "boundary": (w.boundary, B),
             "seam": (ramp * w.seam, S),
             "triangles": (w.triangles, U),
-            "landmarks": (w.landmarks, C),
+            "landmarks": (self.landmark_weight, C),
         }
         for name, term in self.loss_terms.items():
             terms[name] = (term.weight, term(evaluation))
@@ -121,7 +123,6 @@ class PairMap(ConstrainedMap):
             kept = inside(self.domain, h)
             parts = {name: part[kept] for name, part in parts.items()}
         det = torch.linalg.det(jacobian)
-        self.least_determinant = det.detach().min()
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -131,6 +132,33 @@ class PairMap(ConstrainedMap):
         image, jacobian = self.map.value_and_jacobian(uv)
         _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
         return source, first_fundamental_form(outer @ jacobian), jacobian, image
+
+    def curvatures(self) -> list[Curvature]:
+        uv, w = self.batch.uv, self.loss_weights
+        at, count = At(uv, self.batch.points), len(uv)
+        with torch.no_grad():
+            source, _, jacobian, image = self._at(uv)
+            outer = self.psi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
+
+        def energy(j: Tensor) -> Tensor:
+            target = first_fundamental_form(outer @ j)
+            values = self.energy.total(self.energy.parts(source, target, at))
+            return values + w.injectivity * self.folds(torch.linalg.det(j), source, target)
+
+        found = [Curvature(self.map, uv, positive_hessians(energy, jacobian) / count)]
+        if len(self.points):
+            of_landmarks = 2 * self.landmark_weight * torch.eye(2).to(uv)
+            found.append(
+                Curvature(self.map, self.points, of_landmarks.expand(len(self.points), 2, 2))
+            )
+        if len(self.seam) and w.seam > 0:
+            ends = self.seam.reshape(-1, 2)
+            with torch.no_grad():
+                tangents = self.psi.value_and_jacobian(self.map(ends))[1]  # type: ignore[operator]
+            # of both ends of a gap alone, without the product of the two
+            gap = 2 * self.ramp * w.seam / len(self.seam) * first_fundamental_form(tangents)
+            found.append(Curvature(self.map, ends, gap))
+        return found
 
     def _boundary_term(self, image: Tensor) -> Tensor:
         """Mean squared distance of h(∂Ω) to ∂Ω, and of samples outside Ω to Ω."""

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import At, first_fundamental_form, injectivity
+from nsm.energies import At, first_fundamental_form
 from nsm.settings import ParamConstraints, ParamWeights
-from nsm.tasks.fold_barrier import FoldBarrier, further_training, stronger
+from nsm.tasks.curvature import Curvature, positive_hessians
+from nsm.tasks.fold_barrier import FoldBarrier, folds, further_training, stronger
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
 from nsm.tasks.training import Training
@@ -61,7 +62,7 @@ class Param(Training):
         self.save_hyperparameters(ignore=["domain", "energy", "phi", "mesh"], logger=False)
         self.loss_weights = ParamWeights(**loss_weights)
         held = ParamConstraints(**constraints)
-        fixed = held.boundary == "fixed"
+        fixed, self.injectivity = held.boundary == "fixed", held.injectivity
         self.map = planar_map(domain if fixed else None, map, activation, encoding)
         self.energy = as_blend(energy)
         self.loss_terms = made_terms(loss_terms or {})
@@ -74,10 +75,17 @@ class Param(Training):
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        self.batch = batch
         w = self.loss_weights
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
-        G = injectivity(evaluation.determinant).mean()
+        assert evaluation.source is not None and evaluation.target is not None
+        determinant, source, target = (
+            evaluation.determinant,
+            evaluation.source,
+            evaluation.target,
+        )
+        G = folds(self.injectivity, determinant, source, target).mean()
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
 
         loss = energy + w.injectivity * G + w.triangles * U
@@ -98,7 +106,6 @@ class Param(Training):
         B = first_fundamental_form(jacobian)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         det = torch.linalg.det(jacobian)
-        self.least_determinant = det.detach().min()
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -107,6 +114,20 @@ class Param(Training):
             source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
         h, jacobian = self.map.value_and_jacobian(uv)
         return source, jacobian, h
+
+    def curvatures(self) -> list[Curvature]:
+        uv, w = self.batch.uv, self.loss_weights
+        at = At(uv, self.batch.points)
+        with torch.no_grad():
+            source, jacobian, _ = self._at(uv)
+
+        def energy(j: Tensor) -> Tensor:
+            target = first_fundamental_form(j)
+            values = self.energy.total(self.energy.parts(source, target, at))
+            determinant = torch.linalg.det(j)
+            return values + w.injectivity * folds(self.injectivity, determinant, source, target)
+
+        return [Curvature(self.map, uv, positive_hessians(energy, jacobian) / len(uv))]
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""

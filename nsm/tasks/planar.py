@@ -34,6 +34,6 @@ def planar_map(
         out_dim = domain.network_out_dim
         encoding = domain.encoding(encoding, of_map=True)
         if not domain.has_boundary and named_object(map.get("_target_", "")) is SplineField:
-            map = {**map, "periodic": True}
+            map = {**map, "periodic": True, "odd": domain.even}
     network = build_network(map=map, activation=activation, encoding=encoding, out_dim=out_dim)
     return PlanarMap(network) if domain is None else domain.equivariant(network)

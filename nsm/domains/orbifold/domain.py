@@ -278,9 +278,9 @@ class Orbifold(ClosedDomain):
 
     def equivariant(self, network: nn.Module) -> nn.Module:
         """h(x) = x + ½(n(x) - n(-x)) around a periodic network n."""
-        from nsm.maps import EquivariantMap
+        from nsm.maps import EquivariantMap, TorusMap
 
-        return EquivariantMap(network)
+        return TorusMap(network) if getattr(network, "odd", False) else EquivariantMap(network)
 
 
 @dataclass(frozen=True)
