@@ -385,11 +385,14 @@ class ParamConstraints(Checked):
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
             areas at samples that are near to it, for quasi-Newton steps.
+        triangles_from: share of the steps after which the training measures distortion at triangles
+            of the source's mesh, as figures do, instead of samples.
     """
 
     boundary: Literal["free", "fixed"]
     fold_every: Count = 25
     injectivity: Literal["exponential", "smooth"] = "exponential"
+    triangles_from: Share = 1.0
 
 
 @dataclass(frozen=True)
@@ -409,6 +412,8 @@ class PairConstraints(Checked):
         multipliers_from: share of the steps before the multipliers' first update.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
             areas at samples that are near to it, for quasi-Newton steps.
+        triangles_from: share of the steps after which the training measures distortion at triangles
+            of the source's mesh, as figures do, instead of samples.
     """
 
     boundary: Literal["exact", "penalty"]
@@ -420,6 +425,7 @@ class PairConstraints(Checked):
     fold_every: Count = 25
     multipliers_from: Share = 0.0
     injectivity: Literal["exponential", "smooth"] = "exponential"
+    triangles_from: Share = 1.0
 
 
 @dataclass

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
-from nsm.tasks.fold_barrier import folds, further_training, stronger
+from nsm.tasks.fold_barrier import Folds, further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
 
@@ -70,6 +70,7 @@ class ConstrainedMap(Training):
         self.loss_weights = PairWeights(**loss_weights)
         self.constraints = PairConstraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
+        self.folds = Folds(self.constraints.injectivity)
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
@@ -101,15 +102,6 @@ class ConstrainedMap(Training):
         """λ_C, as far as it has risen on the ramp."""
         raised = self.constraints.ramp_of == "weights"
         return self.loss_weights.landmarks * (_FIRST ** (1 - self.ramp) if raised else 1.0)
-
-    def folds(self, determinant: Tensor, source: Tensor, target: Tensor) -> Tensor:
-        """G at points (N,), from det J_h (N,), A and B (N, 2, 2)."""
-        return folds(self.constraints.injectivity, determinant, source, target)
-
-    def folding(self, evaluation: Evaluation) -> Tensor:
-        """The mean of G over the samples."""
-        assert evaluation.source is not None and evaluation.target is not None
-        return self.folds(evaluation.determinant, evaluation.source, evaluation.target).mean()
 
     def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
         """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target, which may

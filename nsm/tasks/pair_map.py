@@ -13,6 +13,7 @@ from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
+from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
 
@@ -73,6 +74,9 @@ class PairMap(ConstrainedMap):
         self.image = Composition(self.psi, self.map)
         held = self.constraints
         self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
+        self.quadrature, self.triangles_from = None, held.triangles_from * max_steps
+        if held.triangles_from < 1:
+            self.quadrature = MeshQuadrature(*mesh, self.phi)
         self.diagonal = diagonal
         self.set_landmarks(points, targets, self.map.before(points), seam)
 
@@ -85,7 +89,7 @@ class PairMap(ConstrainedMap):
         w, ramp = self.loss_weights, self.ramp
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
-        G = self.folding(evaluation)
+        G = self._folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
@@ -115,8 +119,16 @@ class PairMap(ConstrainedMap):
         self.log_terms(loss, terms, distortion=energy)
         return loss
 
+    def _folding(self, e: Evaluation) -> Tensor:
+        """G: the mean over samples, or triangles by their area."""
+        assert e.source is not None and e.target is not None
+        values = self.folds(e.determinant, e.source, e.target, self.global_step)
+        return values.mean() if e.share is None else (e.share * values).sum()
+
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples of the source, and what it is made from."""
+        if self.training and (some := self._triangles(batch)) is not None:
+            return self._on_triangles(some)
         A, B, jacobian, h = self.pointwise(self._at, batch.uv)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         if not self.exact:  # samples that h maps out of Ω do not count
@@ -124,6 +136,23 @@ class PairMap(ConstrainedMap):
             parts = {name: part[kept] for name, part in parts.items()}
         det = torch.linalg.det(jacobian)
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
+
+    def _triangles(self, batch: Samples) -> Triangles | None:
+        """Those at which the distortion of a training step is measured; None: it is at samples."""
+        if self.quadrature is None or self.global_step < self.triangles_from:
+            return None
+        return self.quadrature.take(len(batch.uv))
+
+    def _on_triangles(self, some: Triangles) -> tuple[Distortion, Evaluation]:
+        """The energy of the map that is linear on triangles of the source."""
+        h = self.map(some.uv)
+        A, B = some.metric, first_fundamental_form(some.sides(self.psi(h)))
+        centre = some.points[some.faces].mean(dim=1)
+        parts = self.energy.parts(A, B, At(some.centres, centre))
+        det = torch.linalg.det(some.sides(h)) / some.determinant
+        image = h[some.faces].mean(dim=1)
+        evaluation = Evaluation(some.centres, centre, image, A, B, det, some.oriented)
+        return Distortion(self.energy, parts, some.share), evaluation
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A, B, J_h and h at points (N, 2) of Ω."""
@@ -134,8 +163,11 @@ class PairMap(ConstrainedMap):
         return source, first_fundamental_form(outer @ jacobian), jacobian, image
 
     def curvatures(self) -> list[Curvature]:
-        uv, w = self.batch.uv, self.loss_weights
-        at, count = At(uv, self.batch.points), len(uv)
+        uv, position, w = self.batch.uv, self.batch.points, self.loss_weights
+        share = uv.new_full((len(uv),), 1 / len(uv))
+        if (some := self._triangles(self.batch)) is not None:  # nearly theirs
+            uv, share, position = some.centres, some.share, some.points[some.faces].mean(dim=1)
+        at = At(uv, position)
         with torch.no_grad():
             source, _, jacobian, image = self._at(uv)
             outer = self.psi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
@@ -143,9 +175,11 @@ class PairMap(ConstrainedMap):
         def energy(j: Tensor) -> Tensor:
             target = first_fundamental_form(outer @ j)
             values = self.energy.total(self.energy.parts(source, target, at))
-            return values + w.injectivity * self.folds(torch.linalg.det(j), source, target)
+            folds = self.folds(torch.linalg.det(j), source, target, self.global_step)
+            return values + w.injectivity * folds
 
-        found = [Curvature(self.map, uv, positive_hessians(energy, jacobian) / count)]
+        hessians = share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        found = [Curvature(self.map, uv, hessians)]
         if len(self.points):
             of_landmarks = 2 * self.landmark_weight * torch.eye(2).to(uv)
             found.append(

@@ -16,7 +16,7 @@ from nsm.tasks.curvature import Curvature
 from nsm.tasks.spline_level import Level, Metric
 
 _SUFFICIENT = 1e-4  # Armijo's condition
-_TRIALS = 12
+_TRIALS = 8
 _FLAT = 1e-10  # pairs of less curvature say nothing
 # largest change of a coefficient in the first iteration of a step without known curvature
 _FIRST = 0.02
