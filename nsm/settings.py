@@ -310,8 +310,9 @@ class TrainerSettings:
             hardware has them.
         compile: compile the evaluation of the networks: half a minute at the start, then faster
             steps; without a compiler nothing changes.
-        tabulated: cells a side of a table that stands for the target of a pair map in the
-            training; figures are those of the mesh. null: the target's network itself.
+        tabulated: cells a side of the tables that stand, in the training, for the surfaces at
+            whose points a map arrives; figures are those of the mesh. null: the networks
+            themselves.
         progress: show a progress bar.
         gradient_clip: largest norm of a step's gradient; null: no limit.
         log_every: steps between two values in the logs.

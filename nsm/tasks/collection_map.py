@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
+from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
@@ -94,11 +96,12 @@ class CollectionMap(ConstrainedMap):
         return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
+        self.batch = batch
         w, ramp, scale = self.loss_weights, self.ramp, _SURFACES / len(self.map)
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
-        G = injectivity(evaluation.determinant).mean(dim=1).sum()
+        G = self.folds.of_plane(evaluation.determinant).mean(dim=1).sum()
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self._triangle_term() if w.triangles > 0 else 0.0
@@ -110,7 +113,7 @@ class CollectionMap(ConstrainedMap):
             + w.boundary * B
             + ramp * w.seam * S
             + w.triangles * U
-            + w.landmarks * C
+            + self.landmark_weight * C
         )
         terms: dict[str, Term] = {
             **distortion.terms,
@@ -119,7 +122,7 @@ class CollectionMap(ConstrainedMap):
             "boundary": (scale * w.boundary, B),
             "seam": (scale * ramp * w.seam, S),
             "triangles": (scale * w.triangles, U),
-            "landmarks": (scale * w.landmarks, C),
+            "landmarks": (scale * self.landmark_weight, C),
         }
         for name, term in self.loss_terms.items():
             terms[name] = (term.weight, term(evaluation))
@@ -133,15 +136,52 @@ class CollectionMap(ConstrainedMap):
         forms, determinants, images, positions = (
             part.transpose(0, 1) for part in self.pointwise(self._at, x)
         )
-        # samples lie by the mean of the surfaces' areas: weights make it that of each source
-        area = torch.linalg.det(forms.detach()).clamp(min=0).sqrt()
-        share = area / area.mean(dim=0).clamp(min=1e-12)
-        if not self.exact:  # samples that a map sends out of Ω do not count
-            share = share * inside(self.domain, images.detach()).all(dim=0)
+        share = self._shares(forms.detach(), images.detach())
         i, j = self.ordered
         parts = self.energy.parts(forms[i], forms[j], At(images[i], positions[i]))
         evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
         return Distortion(self.energy, parts, share[i]), evaluation
+
+    def _shares(self, forms: Tensor, images: Tensor) -> Tensor:
+        """How much each sample counts for each source, (k, N).
+
+        Samples lie by the mean of the surfaces' areas: weights make it that of each source.
+        """
+        area = torch.linalg.det(forms).clamp(min=0).sqrt()
+        share = area / area.mean(dim=0).clamp(min=1e-12)
+        if not self.exact:  # samples that a map sends out of Ω do not count
+            share = share * inside(self.domain, images).all(dim=0)
+        return share
+
+    def curvatures(self) -> list[Curvature]:
+        x, w, k = self.batch, self.loss_weights, len(self.map)
+        scale = _SURFACES / k
+        with torch.no_grad():
+            images, inner = batched(list(self.map)).value_and_jacobian(x.expand(k, -1, -1))
+            positions, outer = batched(list(self.phis)).value_and_jacobian(images)
+            forms = first_fundamental_form(outer @ inner)
+            share = self._shares(forms, images).double()
+            share /= share.sum(dim=1, keepdim=True).clamp(min=1e-12) * k * (k - 1)
+
+        def energy(i: int, j: Tensor) -> Tensor:
+            """The part of the loss at each sample that the map of surface i has."""
+            own = first_fundamental_form(outer[i].double() @ j)
+            total = scale * w.injectivity / len(x) * self.folds.of_plane(torch.linalg.det(j))
+            for other in (n for n in range(k) if n != i):
+                there, here = At(images[i], positions[i]), At(images[other], positions[other])
+                to = self.energy.total(self.energy.parts(own, forms[other], there))
+                back = self.energy.total(self.energy.parts(forms[other], own, here))
+                total = total + share[i] * to + share[other] * back
+            return total
+
+        of_landmarks = 2 * scale * self.landmark_weight * torch.eye(2).to(x)
+        found = []
+        for i, h in enumerate(self.map):
+            found.append(Curvature(h, x, positive_hessians(partial(energy, i), inner[i])))
+            if len(self.points):
+                each = of_landmarks.expand(len(self.points), 2, 2)
+                found.append(Curvature(h, self.points, each))
+        return found
 
     def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A_i (N, k, 2, 2), det J_h (N, k), h (N, k, 2) and φ∘h (N, k, 3) of all surfaces at points

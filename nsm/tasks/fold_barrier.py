@@ -118,6 +118,12 @@ class Folds:
         self.kind = kind
         self._held: tuple[int, Tensor] | None = None
 
+    def of_plane(self, determinant: Tensor) -> Tensor:
+        """det J_h (...) to (...), areas being those in Ω."""
+        if self.kind == "exponential":
+            return injectivity(determinant)
+        return unfold(determinant, _SMALL)
+
     def __call__(self, determinant: Tensor, source: Tensor, target: Tensor, step: int) -> Tensor:
         """det J_h (N,), A and B (N, 2, 2) to (N,)."""
         if self.kind == "exponential":
