@@ -74,8 +74,8 @@ class MeshQuadrature(nn.Module):
 
     @torch.no_grad()
     def take(self, count: int) -> Triangles:
-        """All triangles; of a mesh with more than 65,536, the one in the middle of each of ``count``
-        parts of equal area, if these are fewer."""
+        """All triangles; of a mesh with more than 65,536, those in the middle of ``count`` parts
+        of equal area, if these are fewer."""
         if self._taken is not None and self._taken[0] == count:
             return self._taken[1]
         [surface] = self._surface

@@ -140,8 +140,8 @@ class QuasiNewton(Optimizer):
         self._put(at)
         with torch.enable_grad():
             loss = closure()
-        gradients = [f.coefficients.grad for f in self.fields]
-        if loss is None or any(g is None for g in gradients):
+        gradients = [f.coefficients.grad for f in self.fields if f.coefficients.grad is not None]
+        if loss is None or len(gradients) < len(self.fields):
             return None
         value, parts = float(loss), []
         each = zip(self._level[1], gradients, self._split(at), strict=True)
@@ -207,9 +207,7 @@ class QuasiNewton(Optimizer):
 class _Search:
     """The two-loop recursion (Nocedal and Wright, Algorithm 7.4) from the inverse of a metric."""
 
-    def __init__(
-        self, memory: int, solve: Callable[[np.ndarray], np.ndarray], known: bool
-    ) -> None:
+    def __init__(self, memory: int, solve: Callable[[np.ndarray], np.ndarray], known: bool) -> None:
         self.memory, self.solve, self.known = memory, solve, known
         self.s: list[np.ndarray] = []
         self.y: list[np.ndarray] = []
