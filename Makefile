@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-closed bench-correspondence bench-activation bench-speed bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-published bench-closed bench-correspondence bench-activation bench-speed bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -34,6 +34,12 @@ bench-steps: .venv/.nsm-dev
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
 	$(BIN)/python benchmarks/closed_maps.py $(if $(MESHES),--meshes $(MESHES))
+
+# Whole trainings by the published recipe beside the default: half an hour in the reduced form, FORM=full
+# on a GPU. MESHES as above.
+FORM ?= reduced
+bench-published: .venv/.nsm-dev
+	$(BIN)/python benchmarks/published.py --form $(FORM) --meshes $(MESHES)
 
 # Closed surfaces on the disc and on the orbifold, default settings: ten minutes. MESHES as above.
 bench-closed: .venv/.nsm-dev

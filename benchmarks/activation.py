@@ -20,6 +20,7 @@ from rich.console import Console
 from nsm.config import compose_config
 from nsm.pipeline import run
 from nsm.results import NeuralSurface, atomic_write, load_surface
+from nsm.results.metrics import evaluate
 from nsm.results.render import View
 from nsm.results.report import write_report
 from nsm.surfaces.geometry import subdivide
@@ -77,7 +78,7 @@ def _pictures(name: str, neural: NeuralSurface) -> None:
     uv, faces = surface.uv, surface.faces
     for _ in range(2):
         uv, faces = subdivide(uv, faces)
-    _picture(view, neural(uv), faces, name)
+    _picture(view, evaluate(neural.map, uv), faces, name)
     if name == ACTIVATIONS[0]:
         _picture(view, surface.vertices, surface.faces, "source")
 

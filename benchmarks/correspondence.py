@@ -1,12 +1,21 @@
-"""Correspondences without landmarks against annotated ones, on ordered pairs of shapes.
+"""Correspondences with no landmarks or few against annotated ones, on ordered pairs of shapes.
 
     python benchmarks/correspondence.py --meshes FOLDER
 
 The error is that of Kim, Lipman and Funkhouser 2011, "Blended intrinsic maps": at the annotated
 landmarks of the source, the geodesic distance on the target, along edges, from the image to the
-annotated one, over the square root of the area. Writes benchmarks/results/correspondence.json;
-seconds are those of the processor, on one thread, from raw meshes. ``--every N`` takes each N-th
-pair of the animals only.
+annotated one, over the square root of the area. Landmarks that are given are not counted. All maps
+are the coarse ones, before any training on the full meshes.
+
+Rows: ``none``: no landmarks; ``given N``: the N annotated landmarks that are farthest from each
+other, four completed by proposals; ``zoomout``: wave kernel signatures and ZoomOut; ``icp``: the
+best of 24 rotations with iterated closest points, then ZoomOut. The last two are pyfmaps'
+(nsm[peers]), on meshes of 3,000 triangles.
+
+Each figure is kept as a line of benchmarks/results/correspondence.jsonl, so that the benchmark goes
+on where it stopped; without that file it begins anew. Writes correspondence.json beside it and
+docs/pictures/correspondence.png. Seconds are those of the processor, on one thread, from raw
+meshes. ``--every N`` takes each N-th pair of the animals only.
 """
 
 from __future__ import annotations
@@ -14,15 +23,21 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from correspondence_peers import icp_map, zoomout_map
 from scipy.spatial import cKDTree
 
-from nsm.correspondence import Hypothesis, proposed
+from nsm.correspondence import proposed
 from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.preview import previewed
+from nsm.correspondence.search import Candidate
+from nsm.domains.orbifold.common_cones import far_apart
 from nsm.domains.orbifold.cover import located
 from nsm.surfaces.landmark_files import read_landmarks
 from nsm.surfaces.loading import load_mesh
@@ -31,6 +46,8 @@ from nsm.surfaces.topology import face_areas
 from nsm.surfaces.validation import clean
 
 RESULT = Path(__file__).parent / "results" / "correspondence.json"
+LINES = RESULT.with_suffix(".jsonl")
+PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "correspondence.png"
 OTHERS = {
     "bust": ("shrec07-302", "shrec07-314"),
     "plane and bird": ("shrec07-61", "shrec07-248"),
@@ -38,6 +55,7 @@ OTHERS = {
 }
 WRONG = 0.15  # a map with a larger mean error
 SHARES = (0.05, 0.1, 0.25)
+GIVEN = (4, 5, 8)
 
 
 class Annotated(NamedTuple):
@@ -47,6 +65,14 @@ class Annotated(NamedTuple):
     faces: np.ndarray
     landmarks: np.ndarray
     distance: np.ndarray
+
+    @property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.vertices, self.faces
+
+    def errors(self, points: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Errors (K,) of points (K, 3) as images of the landmarks numbered ``which`` (K,)."""
+        return self.distance[which, cKDTree(self.vertices).query(points)[1]]
 
 
 def annotated(meshes: Path, name: str) -> Annotated:
@@ -61,60 +87,150 @@ def annotated(meshes: Path, name: str) -> Annotated:
     return Annotated(mesh.vertices, mesh.faces, landmarks, distance / root)
 
 
-def errors(hypothesis: Hypothesis, source: Annotated, target: Annotated) -> np.ndarray:
-    """The errors (L,) of a hypothesis's coarse map."""
-    found = hypothesis.candidate
+def images(found: Candidate, source: Annotated, target: Annotated) -> np.ndarray:
+    """Points (L, 3) of the target to which a coarse map takes the source's landmarks."""
     ours, theirs = found.source, found.target
     points = source.vertices[source.landmarks]
     places = locate(points, source.vertices[ours.shape.ids], ours.shape.faces)
     corners = ours.embedding.corners()[places.face]
     image = found.planar(np.einsum("nk,nki->ni", places.weights, corners))
-    at = located(theirs.embedding, image).take(
+    return located(theirs.embedding, image).take(
         target.vertices[theirs.shape.ids], theirs.shape.faces
     )
-    nearest = cKDTree(target.vertices).query(at)[1]
-    return target.distance[np.arange(len(nearest)), nearest]
 
 
-def measured(source: Annotated, target: Annotated) -> dict[str, Any]:
+Row = Callable[[Annotated, Annotated], dict[str, Any]]
+
+
+def without(source: Annotated, target: Annotated, given: int = 0) -> dict[str, Any]:
+    """No landmarks, or a few that are completed."""
+    pick = farthest(source, target, given)
+    pairs = np.stack([source.landmarks[pick], target.landmarks[pick]], axis=1)
+    proposal = proposed(source.mesh, target.mesh, pairs)
+    rest = np.setdiff1d(np.arange(len(source.landmarks)), pick)
+    each = [
+        target.errors(images(h.candidate, source, target)[rest], rest) for h in proposal.hypotheses
+    ]
+    return {
+        "errors": each[0],
+        "best alternative": min(float(e.mean()) for e in each),
+        "margin": float(min(proposal.margin, 9.0)),
+        "score": float(proposal.hypotheses[0].score),
+        "sure": proposal.sure,
+    }
+
+
+def through(source: Annotated, target: Annotated, given: int) -> dict[str, Any]:
+    """The coarse map that is drawn through five landmarks or more."""
+    pick = farthest(source, target, given)
+    marks = source.landmarks[pick], target.landmarks[pick]
+    found = previewed(source.mesh, target.mesh, marks, drawn=True).candidate
+    rest = np.setdiff1d(np.arange(len(source.landmarks)), pick)
+    return {"errors": target.errors(images(found, source, target)[rest], rest)}
+
+
+def farthest(source: Annotated, target: Annotated, count: int) -> np.ndarray:
+    """Numbers (count,) of landmarks that are far from each other on both shapes."""
+    if count == 0:
+        return np.zeros(0, dtype=np.int64)
+    shapes = [source, target]
+    return far_apart([s.mesh for s in shapes], [s.landmarks for s in shapes], count)[0]
+
+
+def peer(
+    source: Annotated,
+    target: Annotated,
+    method: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+) -> dict[str, Any]:
+    """A method that takes vertices of the source to points of the target."""
+    points = method(*source.mesh, *target.mesh, source.landmarks)
+    return {"errors": target.errors(points, np.arange(len(points)))}
+
+
+ROWS: dict[str, Row] = {
+    "none": without,
+    **{f"given {n}": partial(without if n == 4 else through, given=n) for n in GIVEN},
+    "zoomout": partial(peer, method=zoomout_map),
+    "icp": partial(peer, method=icp_map),
+}
+
+
+def measured(row: str, source: Annotated, target: Annotated) -> dict[str, Any]:
     """The figures of one pair."""
     start = time.process_time()
-    proposal = proposed((source.vertices, source.faces), (target.vertices, target.faces))
-    seconds = time.process_time() - start
-    each = [errors(h, source, target) for h in proposal.hypotheses]
-    return {
-        "errors": each[0].round(4).tolist(),
-        "mean": round(float(each[0].mean()), 4),
-        "best alternative": round(min(float(e.mean()) for e in each), 4),
-        "margin": round(min(proposal.margin, 9.0), 3),
-        "score": round(proposal.hypotheses[0].score, 3),
-        "sure": proposal.sure,
-        "seconds": round(seconds, 1),
-    }
+    found = ROWS[row](source, target)
+    found["seconds"] = time.process_time() - start
+    found["mean"] = float(np.mean(found["errors"]))
+    return {key: _rounded(value) for key, value in found.items()}
 
 
-def summary(pairs: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The figures of several pairs, mean over all landmarks of all pairs."""
-    every = np.concatenate([np.array(p["errors"]) for p in pairs.values()])
-    wrong = [p for p in pairs.values() if p["mean"] > WRONG]
-    return {
-        "pairs": len(pairs),
-        "mean": round(float(np.mean([p["mean"] for p in pairs.values()])), 4),
-        "best alternative": round(
-            float(np.mean([p["best alternative"] for p in pairs.values()])), 4
-        ),
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 4)
+    return value.round(4).tolist() if isinstance(value, np.ndarray) else value
+
+
+def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of several pairs, shares of all landmarks of all pairs."""
+    every = np.concatenate([np.array(line["errors"]) for line in lines])
+    wrong = [line for line in lines if line["mean"] > WRONG]
+    found = {
+        "pairs": len(lines),
+        "mean": round(float(np.mean([line["mean"] for line in lines])), 4),
         **{f"within {s}": round(float((every <= s).mean()), 3) for s in SHARES},
         "wrong": len(wrong),
-        "sure": sum(p["sure"] for p in pairs.values()),
-        "wrong and sure": sum(p["sure"] for p in wrong),
-        "seconds": round(float(np.mean([p["seconds"] for p in pairs.values()])), 1),
+        "seconds": round(float(np.mean([line["seconds"] for line in lines])), 1),
     }
+    if all("sure" in line for line in lines):
+        found["best alternative"] = round(
+            float(np.mean([line["best alternative"] for line in lines])), 4
+        )
+        found["sure"] = sum(line["sure"] for line in lines)
+        found["wrong and sure"] = sum(line["sure"] for line in wrong)
+    return found
+
+
+def draw(lines: list[dict[str, Any]]) -> None:
+    """Share of landmarks over error, one curve for each row, of the animals."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6, 4))
+    for row in ROWS:
+        chosen = [
+            line["errors"] for line in lines if (line["row"], line["kind"]) == (row, "animals")
+        ]
+        if chosen:
+            every = np.sort(np.concatenate([np.array(e) for e in chosen]))
+            share = 100 * np.arange(1, len(every) + 1) / len(every)
+            axes.plot(every, share, label=f"{row}, {len(chosen)} pairs")
+    axes.set(xlim=(0, 0.3), ylim=(0, 100), xlabel="geodesic error / √area", ylabel="landmarks, %")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(PICTURE, dpi=120)
+    plt.close(figure)
+
+
+def write(lines: list[dict[str, Any]]) -> None:
+    """The JSON of all lines, a summary for each kind and row, and the picture."""
+    result: dict[str, Any] = {}
+    for row in ROWS:
+        for kind in ("animals", *OTHERS):
+            chosen = [line for line in lines if (line["row"], line["kind"]) == (row, kind)]
+            if chosen:
+                result.setdefault(kind, {})[row] = summary(chosen)
+    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    draw(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", type=Path, default=Path("meshes"), help="folder of the meshes")
     parser.add_argument("--every", type=int, default=1, help="each N-th pair of the animals")
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), help="which rows")
     given = parser.parse_args()
     torch.set_num_threads(1)
     animals = sorted(
@@ -122,21 +238,29 @@ def main() -> None:
         for file in (given.meshes / "landmarks").glob("shrec07-*.vts")
         if len(read_landmarks(file)) == 21
     )
-    sets = {"animals": [(a, b) for a in animals for b in animals if a != b][:: given.every]}
-    sets.update({name: [(a, b), (b, a)] for name, (a, b) in OTHERS.items()})
+    sets = {name: [(a, b), (b, a)] for name, (a, b) in OTHERS.items()}
+    sets["animals"] = [(a, b) for a in animals for b in animals if a != b][:: given.every]
+    lines = [json.loads(line) for line in LINES.read_text().splitlines()] if LINES.exists() else []
+    done = {(line["row"], line["source"], line["target"]) for line in lines}
     shapes: dict[str, Annotated] = {}
-    results: dict[str, Any] = {}
-    for kind, pairs in sets.items():
-        figures = {}
-        for pair in pairs:
-            for name in pair:
-                if name not in shapes:
-                    shapes[name] = annotated(given.meshes, name)
-            figures[" ".join(pair)] = measured(shapes[pair[0]], shapes[pair[1]])
-            print(kind, *pair, {**figures[" ".join(pair)], "errors": "..."}, flush=True)
-        results[kind] = {"all": summary(figures), "pairs": figures}
-        print(kind, results[kind]["all"], flush=True)
-        RESULT.write_text(json.dumps(results, indent=1) + "\n")
+    for row in given.rows:
+        for kind, pairs in sets.items():
+            for pair in pairs:
+                if (row, *pair) in done:
+                    continue
+                for name in pair:
+                    if name not in shapes:
+                        shapes[name] = annotated(given.meshes, name)
+                ends = [shapes[name] for name in pair]
+                if row.startswith("given") and len(ends[0].landmarks) <= int(row.split()[1]) + 2:
+                    continue  # nothing would be left to measure
+                line = {"row": row, "kind": kind, "source": pair[0], "target": pair[1]}
+                line.update(measured(row, *ends))
+                lines.append(line)
+                with LINES.open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+                print({**line, "errors": "..."}, flush=True)
+        write(lines)
 
 
 if __name__ == "__main__":

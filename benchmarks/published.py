@@ -1,89 +1,277 @@
-"""The published recipe of one training step, restated to compare its cost.
+"""Whole trainings by the published recipe, each to its own stop, beside the default settings.
 
-Jacobians come from one ``autograd.grad`` with a separate graph per output, tangent frames from a
-batched SVD, and distortions from explicit inverses.
+An animal is overfitted and mapped to another surface over the disc, with experiment=paper and with
+the default. The published recipe takes days on a CPU, so that what is trained there is a reduced
+form, with narrower and fewer layers of φ, fewer steps and a target in closed form, as ``FORMS``
+says and the result states; --form full is for a GPU. It is measured when the default is done and
+where it stops itself.
+
+    python benchmarks/published.py --meshes FOLDER [--form full]
+
+Seconds are the CPU time of one thread, or the time on the GPU. What is in the result file is not
+repeated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from rich.console import Console
+from training import Clock, train
 
-EPSILON = 0.01
+import nsm
+from nsm.config import compose_config
+from nsm.domains import Surface
+from nsm.maps.analytic import ANALYTIC
+from nsm.pipeline import built, make_task, quiet_lightning
+from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.results import NeuralSurface, analytic_surface, atomic_write, overfit_metrics
+from nsm.results.callbacks import GradientWatch
+from nsm.surfaces.cache import cache_folder
 
-
-def jacobian(y: Tensor, x: Tensor) -> Tensor:
-    """The Jacobians (N, n, 2) of outputs y (N, n) with respect to points x (N, 2)."""
-    rows = [torch.autograd.grad(y[:, i].sum(), x, create_graph=True)[0] for i in range(y.shape[1])]
-    return torch.stack(rows, dim=1)
-
-
-def overfit(phi: nn.Module, uv: Tensor, points: Tensor, normals: Tensor) -> Tensor:
-    """Eq. 1 with λ_n = 0.01."""
-    x = uv.clone().requires_grad_()
-    value = phi(x)
-    j = jacobian(value, x)
-    normal = nn.functional.normalize(torch.linalg.cross(j[:, :, 0], j[:, :, 1]), dim=1)
-    position = ((value - points) ** 2).sum(dim=1).mean()
-    return position + 0.01 * ((normal - normals) ** 2).sum(dim=1).mean()
+RESULTS = Path(__file__).parent / "results"
+SOURCE = "shrec07-384"
 
 
-def _flattened(j: Tensor) -> Tensor:
-    """J_φ (N, 3, 2) in an orthonormal frame of the tangent plane, (N, 2, 2)."""
-    frame, _, _ = torch.linalg.svd(j.detach(), full_matrices=False)
-    return frame.transpose(1, 2) @ j
+@dataclass(frozen=True)
+class Form:
+    """How much of the published recipe is trained.
+
+    Attributes:
+        label: of the tables.
+        target: of the map: a mesh, by the name of its file, or a surface in closed form.
+        surface, pair: overrides beside experiment=paper.
+    """
+
+    label: str
+    target: str
+    surface: tuple[str, ...] = ()
+    pair: tuple[str, ...] = ()
 
 
-def _dirichlet(j: Tensor) -> Tensor:
-    m = j.transpose(1, 2) @ j
-    shifted = m + EPSILON * torch.eye(2, device=j.device)
-    trace = m.diagonal(dim1=1, dim2=2).sum(dim=1)
-    return trace + torch.linalg.inv(shifted).diagonal(dim1=1, dim2=2).sum(dim=1)
+FORMS = {
+    "full": Form("published recipe", "shrec07-388"),
+    "reduced": Form(
+        "published recipe, reduced: φ of 4 blocks of 32 for 7,000 steps, h of 4 layers of 128 for "
+        "2,000 steps, to a cap of the sphere",
+        "sphere_cap",
+        ("map.width=32", "map.depth=4", "trainer.max_steps=7000"),
+        ("trainer.max_steps=2000",),
+    ),
+}
+QUIET = ["logger=none", "artefacts=false", "trainer.progress=false", "domain=disc"]
 
 
-def _injectivity(j: Tensor) -> Tensor:
-    det = torch.linalg.det(j)
-    return 100 * (-det.sign() * torch.exp(-det)).clamp(min=0).mean()
+def seconds() -> float:
+    """CPU time of the process; on a GPU, time."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+        return time.perf_counter()
+    return time.process_time()
 
 
-def _boundary(h: nn.Module, boundary_points: Tensor) -> Tensor:
-    return 1e6 * ((h(boundary_points).norm(dim=1) - 1) ** 2).mean()
+class Store:
+    """The result file, written after each entry."""
+
+    def __init__(self, file: Path, form: Form) -> None:
+        self.file = file
+        self.found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+        self.found |= {"form": form.label, "machine": _machine(), "torch": torch.__version__}
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.found
+
+    def put(self, key: str, value: dict[str, Any]) -> None:
+        self.found[key] = value
+        atomic_write(self.file, (json.dumps(self.found, indent=1) + "\n").encode())
+        print(key, value.get("seconds"), flush=True)
 
 
-def param(phi: nn.Module, h: nn.Module, uv: Tensor) -> Tensor:
-    """Symmetric Dirichlet energy of the map from φ's surface to the plane, with G."""
-    x = uv.clone().requires_grad_()
-    source, planar = jacobian(phi(x), x), jacobian(h(x), x)
-    j = planar @ torch.linalg.inv(_flattened(source))
-    return _dirichlet(j).mean() + _injectivity(planar)
+def _machine() -> str:
+    if torch.cuda.is_available():
+        return str(torch.cuda.get_device_name())
+    return "one thread of a CPU"
 
 
-def pair_map(
-    phi: nn.Module, psi: nn.Module, h: nn.Module, uv: Tensor, boundary_points: Tensor
-) -> Tensor:
-    """Symmetric Dirichlet energy of the map f∘φ = ψ∘h, with B and G."""
-    x = uv.clone().requires_grad_()
-    image = h(x)
-    source, planar = jacobian(phi(x), x), jacobian(image, x)
-    target = jacobian(psi(image), x)
-    j = target @ torch.linalg.inv(_flattened(source))
-    return _dirichlet(j).mean() + _injectivity(planar) + _boundary(h, boundary_points)
+def trained(
+    config: Any, inputs: tuple[Any, ...], surface: Surface, when: float, measured: Any
+) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """Train by the published recipe to its own stop.
+
+    Args:
+        config: of the training.
+        inputs: what its task takes.
+        surface: of the samples.
+        when: seconds after which it is measured for the first time.
+        measured: from the module to its figures.
+
+    Returns:
+        The module, its entry after those seconds, and that at its stop.
+    """
+    early: dict[str, Any] = {}
+
+    def at_mark(module: Any, spent: float, step: int) -> None:
+        early.update(seconds=spent, steps=step, metrics=measured(module))
+        module.train()
+
+    settings = config.trainer
+    watch = GradientWatch(
+        settings.log_every,
+        settings.stop_gradient_norm,
+        settings.stop_window,
+        summed=settings.stop_norm_of == "sum",
+    )
+    clock = Clock([when, math.inf], at_mark)
+    trainer, module, _ = train(config, surface, [clock, watch], inputs=inputs)
+    stop = {
+        "seconds": clock.spent,
+        "steps": trainer.global_step,
+        "stopped_by": "max_steps" if trainer.global_step >= settings.max_steps else "gradient norm",
+        "gradient_norm_of_the_sum": _norm(watch, config, surface),
+        "metrics": measured(module),
+    }
+    return module, early or stop, stop
 
 
-def collection_map(
-    phis: Sequence[nn.Module], maps: Sequence[nn.Module], uv: Tensor, boundary_points: Tensor
-) -> Tensor:
-    """The mean of that energy over all ordered pairs, with B and G of every map."""
-    x = uv.clone().requires_grad_()
-    total, curves = uv.new_zeros(()), []
-    for phi, h in zip(phis, maps, strict=True):
-        image = h(x)
-        total = total + _injectivity(jacobian(image, x)) + _boundary(h, boundary_points)
-        curves.append(jacobian(phi(image), x))
-    pairs = [(i, j) for i in range(len(phis)) for j in range(len(phis)) if i != j]
-    for i, j in pairs:
-        f = curves[j] @ torch.linalg.inv(_flattened(curves[i]))
-        total = total + _dirichlet(f).mean() / len(pairs)
-    return total
+def _norm(watch: GradientWatch, config: Any, surface: Surface) -> float:
+    """The mean norm of the last steps' gradients that the stopping rule compares."""
+    samples = config.data.batch_size + len(surface.vertices) * config.sampler.every_vertex
+    return samples * sum(watch.recent) / max(1, len(watch.recent))
+
+
+def overfitted(store: Store, name: str, meshes: Path, form: Form, folder: Path) -> list[Any]:
+    """Neural surfaces of an animal by default and by the published recipe, and their figures."""
+    surface = Surface.load(meshes / f"{name}.off", domain="disc")
+    places = [folder / f"{name}-default", folder / name]
+
+    def figures(module: Any) -> dict[str, float]:
+        return overfit_metrics(surface, module.map.eval())
+
+    def keep(place: Path, module: Any, metrics: dict[str, float]) -> None:
+        NeuralSurface(surface, module.map.eval().requires_grad_(False), metrics, {}).save(place)
+
+    if f"{name}/default" not in store or not places[0].exists():
+        start = seconds()
+        trainer, module, _ = train(compose_config(["domain=disc"]), surface, [])
+        spent, metrics = seconds() - start, figures(module)
+        keep(places[0], module, metrics)
+        entry = {"seconds": spent, "steps": trainer.global_step, "metrics": metrics}
+        store.put(f"{name}/default", entry)
+    if f"{name}/published" not in store or not places[1].exists():
+        when = store.found[f"{name}/default"]["seconds"]
+        config = compose_config(["experiment=paper", *form.surface])
+        module, early, stop = trained(config, (surface,), surface, when, figures)
+        keep(places[1], module, stop["metrics"])
+        store.put(f"{name}/published, same time", early)
+        store.put(f"{name}/published", stop)
+    return [nsm.load(place) for place in places]
+
+
+def mapped(
+    store: Store, phis: list[Any], psis: list[Any], landmarks: list[np.ndarray], form: Form
+) -> None:
+    """The map by default and by the published recipe, the latter before and after its training.
+
+    Args:
+        store: where it is put.
+        phis, psis: neural surfaces of source and target, by default and by the recipe.
+        landmarks: vertices (L,) of both files.
+        form: of the recipe.
+    """
+    pair = f"{SOURCE} → {form.target}"
+    if f"{pair}/default" not in store:
+        pairs = np.stack(landmarks, axis=1).tolist() or None
+        start = seconds()
+        f = nsm.map_pair(phis[0], psis[0], pairs, progress=False)
+        spent = seconds() - start
+        steps = f.config["trainer"]["max_steps"]
+        store.put(f"{pair}/default", {"seconds": spent, "steps": steps, "metrics": f.metrics})
+    if f"{pair}/published" in store:
+        return
+    config = compose_config(["task=pair_map", "experiment=paper", *QUIET, *form.pair])
+    task: Any = make_task(config, Console(quiet=True))
+    task.use(phis[1], psis[1], landmarks)
+
+    def figures(module: Any) -> dict[str, float]:
+        result = task.make_result(module)
+        task.measure(result)
+        return dict(result.metrics)
+
+    store.put(f"{pair}/before", {"seconds": 0.0, "steps": 0, "metrics": figures(built(task))})
+    when = store.found[f"{pair}/default"]["seconds"]
+    inputs = (phis[1], psis[1], landmarks)
+    _, early, stop = trained(config, inputs, phis[1].surface, when, figures)
+    store.put(f"{pair}/published, same time", early)
+    store.put(f"{pair}/published", stop)
+
+
+COLUMNS = {
+    "rms_percent": "RMS, % of diagonal",
+    "normal_error_mean_degrees": "normal error, mean",
+}
+MAP_COLUMNS = {
+    "symmetric_dirichlet_median": "median",
+    "symmetric_dirichlet_mean": "mean",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_percent": "flipped %",
+    "outside_percent": "outside %",
+    "landmark_error_max_percent": "landmark error, largest",
+}
+
+
+def tables(file: Path) -> str:
+    """The result file as Markdown."""
+    found = json.loads(file.read_text())
+    entries = {key: value for key, value in found.items() if "/" in key}
+    parts = [f"{found['form']}. Seconds of {found['machine']}."]
+    for columns in (COLUMNS, MAP_COLUMNS):
+        first = next(iter(columns))
+        shown = {k: v for k, v in entries.items() if first in v["metrics"]}
+        lines = [f"| training | seconds | steps | {' | '.join(columns.values())} |"]
+        lines.append("|---" * (3 + len(columns)) + "|")
+        for key, entry in shown.items():
+            told = [entry["metrics"].get(name) for name in columns]
+            figures = " | ".join("–" if one is None else f"{one:.3f}" for one in told)
+            spent = f"{entry['seconds']:.0f} | {entry['steps']}"
+            lines.append(f"| {key.replace('/', ', ')} | {spent} | {figures} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--meshes", type=Path, required=True, help="folder with the mesh files")
+    parser.add_argument("--form", default="reduced", choices=list(FORMS))
+    parser.add_argument("--folder", type=Path, default=RESULTS, help="of the result file")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    quiet_lightning()
+    form = FORMS[arguments.form]
+    card = f"-{_machine().replace(' ', '-')}" if torch.cuda.is_available() else ""
+    file = arguments.folder / f"published-{arguments.form}{card}.json"
+    store, kept = Store(file, form), cache_folder() / "published" / file.stem
+    meshes = arguments.meshes
+    phis = overfitted(store, SOURCE, meshes, form, kept)
+    if form.target in ANALYTIC:
+        psis = [analytic_surface({"name": form.target}, "disc")] * 2
+        landmarks = [np.zeros(0, dtype=np.int64)] * 2
+    else:
+        psis = overfitted(store, form.target, meshes, form, kept)
+        marks = [str(meshes / "landmarks" / f"{name}.vts") for name in (SOURCE, form.target)]
+        landmarks = landmark_vertices(marks, [phis[1], psis[1]], Console(quiet=True))
+    mapped(store, phis, psis, landmarks, form)
+    text = tables(file)
+    file.with_suffix(".md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,7 +20,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-import published
+import published_step as published
 import scale
 import torch
 from omegaconf import DictConfig

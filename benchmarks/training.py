@@ -95,18 +95,20 @@ def train(
     callbacks: list[Callback],
     max_steps: int | None = None,
     exchanged: Callable[[Overfit], Overfit] = lambda module: module,
+    inputs: Sequence[Any] | None = None,
 ) -> tuple[pl.Trainer, Any, float]:
-    """Train a network on a surface; returns the trainer, the module and the CPU seconds.
+    """Train a network at samples of a surface; returns the trainer, the module and the CPU seconds.
 
     Args:
-        config: settings of task=overfit.
+        config: settings of the run.
         surface: the prepared surface.
         callbacks: of Lightning.
         max_steps: length of the training, -1 without limit; that of its schedule by default.
         exchanged: from nsm's module to the one that is trained.
+        inputs: what the method ``use`` of the task takes; by default the surface.
     """
     start = time.process_time()
-    module = exchanged(module_of(config, surface))
+    module = exchanged(module_of(config, *([surface] if inputs is None else inputs)))
     data = samples_of(config, surface, getattr(module, "samples", SurfaceData))
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(

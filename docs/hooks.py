@@ -22,7 +22,7 @@ from nsm.help import (  # noqa: E402
     plain_settings,
 )
 
-FIRST = ("tutorial.md", "extending.md")
+FIRST = ("tutorial.md", "tutorial_texture.md", "tutorial_scans.md", "extending.md")
 REFERENCE = ("settings.md", "api.md")
 
 

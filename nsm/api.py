@@ -30,6 +30,8 @@ from nsm.results import (
     load_surface,
     load_surface_map,
 )
+from nsm.results.parameterization_atlas import FILE as ATLAS
+from nsm.results.parameterization_atlas import ParameterizationAtlas, load_atlas
 from nsm.run_directories import temporary_folder
 from nsm.sweeps import is_complete
 
@@ -77,7 +79,7 @@ def parameterize(
     folder: str | Path | None = None,
     progress: bool = True,
     **settings: Any,
-) -> Parameterization:
+) -> Parameterization | ParameterizationAtlas:
     """Flatten a neural surface to the plane with least distortion and a free boundary.
 
     Args:
@@ -87,7 +89,8 @@ def parameterize(
 
     Returns:
         The map with its new coordinates in ``uv``, and its figures beside those of libigl's
-        methods in ``metrics``.
+        methods in ``metrics``; or, where ``seams`` cut the mesh into several charts, an atlas of
+        such maps.
 
     Raises:
         NsmError: a setting that does not exist or cannot be used.
@@ -145,9 +148,10 @@ def map_pair(
 
 
 def map_collection(
-    surfaces: Sequence[Any],
+    surfaces: Any,
     landmarks: Any = None,
     *,
+    template: Any = None,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: bool = True,
@@ -156,26 +160,31 @@ def map_collection(
     """Put three surfaces or more into correspondence, every one with every other.
 
     Args:
-        surfaces: as for :func:`map_pair`.
-        landmarks: for each surface a list of vertices or points, or a file; or one JSON file.
+        surfaces: as for :func:`map_pair`, in a list; or a pattern of files, ``"scans/*.ply"``.
+        landmarks: for each surface a list of vertices or points, None for one that it lacks, or a
+            file; or one JSON or CSV file; or a folder with a file for each surface. By default
+            files beside the meshes that have their names.
+        template: a surface that all others are mapped to and from; the first of the collection.
         overrides, folder, progress, **settings: as for :func:`overfit`.
 
     Returns:
-        The collection; ``collection.pair(i, j)`` is the map from one surface to another.
+        The collection; ``collection.pair(i, j)`` is the map from one surface to another, by number
+        or name.
 
     Raises:
         NsmError: a surface, landmark or setting that cannot be used.
 
     Examples:
         >>> animals = nsm.map_collection(["a.off", "b.off", "c.off"], ["a.vts", "b.vts", "c.vts"])
-        >>> animals.pair(0, 2).transfer(colours)
+        >>> animals.pair("a", "c").transfer(colours)
     """
-    if not isinstance(surfaces, Sequence) or isinstance(surfaces, str):
+    if not isinstance(surfaces, (Sequence, Path)):
         raise NsmError("surfaces: give a list of them", kind="wrong_type", key="surfaces")
-    ready = _prepared(surfaces)
+    listed = [surfaces] if isinstance(surfaces, (str, Path)) else surfaces
+    ready = _prepared([*listed, template])
     request = _Request("collection_map", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
-        given = Given(surfaces=surfaces, landmarks=landmarks)
+        given = Given(surfaces=listed, landmarks=landmarks, template=template)
         return run_task(config, place, given=given, quiet=not progress)
 
 
@@ -186,7 +195,9 @@ def _prepared(given: Sequence[Any]) -> list[Surface]:
 
 
 # what the function that is called, and its arguments, say
-_ARGUMENTS = ("task", "surface", "phi.path", "source", "target", "surfaces", "landmarks")
+_ARGUMENTS = (
+    *("task", "surface", "phi.path", "source", "target", "surfaces", "template", "landmarks"),
+)
 
 
 class _Request:
@@ -326,7 +337,7 @@ def _name(target: Any) -> Any:
 
 def load(
     folder: str | Path, *, trust: str | Sequence[str] = ()
-) -> NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection:
+) -> NeuralSurface | Parameterization | ParameterizationAtlas | SurfaceMap | SurfaceCollection:
     """Load the result of a run.
 
     Args:
@@ -352,6 +363,8 @@ def load(
         return load_collection(folder, trust=trust)
     if (place / "pair.json").exists():
         return load_surface_map(folder, trust=trust)
+    if (place / ATLAS).exists():
+        return load_atlas(folder, trust=trust)
     if (place / "map.json").exists():
         return load_parameterization(folder, trust=trust)
     if place.is_dir() and not list(place.glob("surface.*")):

@@ -16,13 +16,13 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from nsm.arguments import Arguments
 from nsm.command_line import prepared_overrides, with_task
-from nsm.config import conf_folder, register, setting_error
+from nsm.config import conf_folder, read_config, register, setting_error
 from nsm.errors import NsmError, of_disk
 from nsm.plugins import import_here, import_plugins
 from nsm.run_directories import remove_empty
@@ -79,8 +79,10 @@ def main() -> None:
     try:
         import_here()
         status = _main(arguments)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         status = 130
+        if not stop.args and not COMMANDS.keys() & set(arguments[:1]):  # Ctrl-C ends a viewer
+            _say("interrupted")
     except Exception as error:
         if debug:
             traceback.print_exception(error)
@@ -145,13 +147,17 @@ def _run_tasks(arguments: list[str]) -> int:
     register()
     import_plugins()
     OUTCOMES.clear()
+    # Hydra would print what it composes, without the defaults of classes and functions
+    shown = arguments[:2] == ["--cfg", "job"] and "--package" not in arguments
+    if shown:
+        arguments = [word for word in arguments[2:] if word != "--resolve"]
 
     failures: list[Exception] = []
 
     @hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")
     def job(config: DictConfig) -> None:
         try:
-            _run(config)
+            _run(config, shown=shown)
         except Exception as error:  # Hydra would print a line of its own about it
             failures.append(error)
 
@@ -178,16 +184,19 @@ def _process_of_hydra(arguments: list[str]) -> Iterator[None]:
             os.environ["HYDRA_FULL_ERROR"] = before[1]
 
 
-def _run(config: DictConfig) -> None:
-    """Run the one job of a command that is no sweep."""
+def _run(config: DictConfig, *, shown: bool = False) -> None:
+    """Run the one job of a command that is no sweep, or show its settings alone."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     overrides = list(HydraConfig.get().overrides.task)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
-        with stage(Console(highlight=False, markup=False), "loading libraries"):
+        with stage(Console(highlight=False, markup=False, stderr=shown), "loading libraries"):
             from nsm.config_validation import checked
 
             complete = checked(config, overrides)
+            if shown:
+                print(OmegaConf.to_yaml(complete, resolve=True), end="")
+                return
             if complete.resume is not None:
                 _check_alone(str(complete.resume), overrides)
             from nsm.pipeline import run
@@ -212,12 +221,27 @@ def _check_alone(resume: str, overrides: Sequence[str]) -> None:
 
 
 def _sum_up() -> int:
-    """Print how a sweep went; exit status 1 if jobs of it failed."""
+    """Compare the jobs of a sweep, and print how it went; exit status 1 if jobs of it failed."""
     failed = [outcome for outcome in OUTCOMES if outcome.error is not None]
+    complete = [outcome.folder for outcome in OUTCOMES if outcome.error is None]
+    if len(complete) > 1:
+        _compare(complete)
     print(summary(OUTCOMES))
     for outcome in failed:
         _say(f"failed: {' '.join(outcome.overrides) or outcome.folder}: {outcome.error}")
     return 1 if failed else 0
+
+
+def _compare(folders: Sequence[Path]) -> None:
+    """Leave the figure and the table of a sweep's jobs in its folder, and print the table."""
+    console = Console(highlight=False, markup=False)
+    with stage(console, "figure of the sweep"):
+        from nsm.results.report.sweep import write_sweep
+
+        artefacts = read_config(folders[0] / "config.yaml").get("artefacts", True)
+        table = write_sweep(folders[0].parent, figure=bool(artefacts))
+    if table is not None:
+        console.print(table)
 
 
 def _answer(error: Exception) -> int:

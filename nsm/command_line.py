@@ -17,7 +17,17 @@ from nsm.settings import conf_folder
 
 # settings that are files or folders: `~` stands for the home folder in them, and signs that Hydra's
 # grammar reserves are quoted for the user
-_PATHS = ("surface.path", "phi.path", "source", "target", "landmarks", "resume", "hydra.run.dir")
+_PATHS = (
+    "surface.path",
+    "phi.path",
+    "source",
+    "target",
+    "surfaces",
+    "template",
+    "landmarks",
+    "resume",
+    "hydra.run.dir",
+)
 _LISTS = ("surfaces", "landmarks")  # in brackets, of files
 _PLAIN = re.compile(r"[\w./+-]+")  # what has one meaning for Hydra
 _DEVICES = {"cuda": "gpu", "gpu": "gpu", "cpu": "cpu", "auto": "auto"}

@@ -67,7 +67,9 @@ def _run_folder(
         return str(resume)
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     ends = (surface,) if target is None else (source, target)
-    what = "-".join(map(_short_name, ends if surfaces is None else surfaces))
+    if surfaces is not None:
+        ends = (surfaces,) if isinstance(surfaces, str) else tuple(surfaces)
+    what = "-".join(map(_short_name, ends))
     folder = f"outputs/{_task_name(task)}/{what[:_LONGEST_NAME]}-{stamp}"
     number, free = 2, folder
     while Path(free).exists():  # runs started within the same second
@@ -79,7 +81,8 @@ def _short_name(surface: Any) -> str:
     """A short name for what ``surface``, ``source`` or ``target`` names."""
     if isinstance(surface, (dict, DictConfig)):
         return Path(surface["path"]).stem if surface.get("path") else str(surface.get("name"))
-    return Path(str(surface)).stem
+    path = Path(str(surface))
+    return path.parent.name if "*" in path.name else path.stem  # of all scans in a folder
 
 
 def compose_config(

@@ -31,7 +31,11 @@ _DEFAULT = re.compile(r"  - (?:override )?([^\s:]+): (\S+)$")
 # whose docstrings say what the settings of these groups are
 _DATACLASSES: dict[str, tuple[type, ...]] = {
     "loss_weights": (plain.OverfitWeights, plain.ParamWeights, plain.PairWeights),
-    "constraints": (plain.ParamConstraints, plain.PairConstraints),
+    "constraints": (
+        plain.ParamConstraints,
+        plain.PairConstraints,
+        plain.CollectionConstraints,
+    ),
 }
 
 

@@ -204,7 +204,10 @@ class SurfaceSettings:
             falling area, says which is kept; null: small ones are removed, others refused.
         repair: split cuts a mesh apart at non-manifold edges (three faces or more); null: it is
             refused.
-        parameterization: of the mesh over Ω: slim (low distortion) or tutte.
+        fill_holes: fill holes of at most so many edges for the map; true: small ones, shorter than
+            half the square root of the area; exported meshes keep the holes.
+        parameterization: of the mesh over Ω: slim (low distortion) or tutte; or given, of an OBJ,
+            PLY or GLB file: it is cut and laid out as its texture coordinates are.
         cache: keep the prepared surface on disk, under a hash of its content.
     """
 
@@ -214,7 +217,8 @@ class SurfaceSettings:
     cones: list[int] | None = None
     parts: Literal["largest"] | Whole | None = None
     repair: Literal["split"] | None = None
-    parameterization: Literal["slim", "tutte"] = "slim"
+    fill_holes: bool | Count = False
+    parameterization: Literal["slim", "tutte", "given"] = "slim"
     cache: bool = True
 
 
@@ -223,13 +227,19 @@ class PhiSettings:
     """The neural surface that a map starts from.
 
     Args:
-        path: for task=param, the run folder of a neural surface; null: one is trained.
+        path: for task=param, the run folder of a neural surface; null: one is made.
         overrides: for maps, settings of the trainings of their neural surfaces, as in
             'phi.overrides=["map=residual","seed=1"]'.
+        steps: for maps, steps of these trainings at most, where they start from a least-squares
+            fit, which is near enough for a map; null: as many as task=overfit makes.
+        processes: for maps of several meshes, how many are prepared at once, each by a process on a
+            CPU core of its own; null: as many as there are cores.
     """
 
     path: str | None = None
     overrides: list[str] = field(default_factory=list)
+    steps: Whole | None = 0
+    processes: Count | None = None
 
 
 @dataclass
@@ -247,14 +257,17 @@ class AttributesSettings:
 
 @dataclass
 class ProposalSettings:
-    """What happens to landmarks that landmarks=auto proposes.
+    """What happens to landmarks that nsm proposes for closed meshes of genus 0.
 
     Args:
         strict: end with an error where the proposal is not sure, before any training.
         alternative: which proposal is taken: 0 the best, 1 the second best.
+        complete: one to four given landmarks are completed by proposed ones; to four, only where
+            these are sure.
     """
 
     strict: bool = False
+    complete: bool = True
     alternative: Whole = 0
 
 
@@ -295,14 +308,14 @@ class TrainerSettings:
     """Length, hardware and stopping rule of the training, and what it records.
 
     Args:
-        max_steps: steps of the optimizer.
+        max_steps: steps of the optimizer; 0: the network stays as it starts.
         accelerator: auto, cpu or gpu.
         devices: processes that share each step, each with its part of the batch on its own CPU
             core or GPU.
         stop_gradient_norm: stop when the norm of the gradient, averaged over ``stop_window``
             steps, falls below this; null: never.
         stop_norm_of: the loss whose norm is meant: mean over the batch, as it is trained; or sum,
-            the mean's times ``data.batch_size``.
+            the mean's times the number of samples in the batch.
         stop_window: steps over which the norm is averaged.
         threads: of the CPU; the default networks are so small that one is fastest. null: what
             torch chooses, for large networks.
@@ -316,10 +329,13 @@ class TrainerSettings:
         progress: show a progress bar.
         gradient_clip: largest norm of a step's gradient; null: no limit.
         log_every: steps between two values in the logs.
-        log_pictures: pictures of the surface or map in the logs.
+        log_pictures: pictures of the surface or map in the logs, the first before the training and
+            the last at its end.
+        log_meshes: the same as meshes, which TensorBoard shows in 3D; each takes 40 bytes a vertex.
+        log_histograms: histograms of weights and gradients in TensorBoard, as evenly.
     """
 
-    max_steps: Count = 8000
+    max_steps: Whole = 8000
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: Count = 1
     stop_gradient_norm: Weight | None = None
@@ -333,6 +349,8 @@ class TrainerSettings:
     gradient_clip: Weight | None = None
     log_every: Count = 25
     log_pictures: Whole = 6
+    log_meshes: Whole = 0
+    log_histograms: Whole = 6
 
 
 @dataclass(frozen=True)
@@ -429,6 +447,31 @@ class PairConstraints(Checked):
     triangles_from: Share = 1.0
 
 
+@dataclass(frozen=True)
+class CollectionConstraints(PairConstraints):
+    """How task=collection_map constrains its maps.
+
+    Args:
+        boundary: exact: every h_i keeps to the domain by construction; penalty: λ_B pulls the image
+            of the boundary to ∂Ω.
+        landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
+        multiplier_every: steps between two updates of the multipliers.
+        ramp: share of the steps over which the weights of landmarks and seam rise to their values.
+        fold_margin: what the determinant of J_h must stay above at the mesh triangles.
+        fold_every: steps between two looks for the mesh triangles nearest to folding.
+        multipliers_from: share of the steps before the multipliers' first update.
+        ramp_of: what the ramp moves of the landmarks: targets, from where h_i has them at its
+            start; or weights: λ_C grows from a thousandth.
+        injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
+            det J_h at samples that are near to it, for quasi-Newton steps.
+        triangles_from: of task=pair_map alone.
+        pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
+            mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.
+    """
+
+    pairs: Literal["mean", "sum"] = "mean"
+
+
 @dataclass
 class Settings:
     """The settings of a run outside the groups.
@@ -437,14 +480,23 @@ class Settings:
         source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface.
         target: the same; or an analytic surface: a name (sphere_cap, plane, ...; sphere with
             domain=orbifold, torus with domain=torus) or '{name: graph, z: 0.3*u*v}'.
-        surfaces: of task=collection_map: three surfaces or more, each as source.
+        surfaces: of task=collection_map: three surfaces or more, each as source; or a pattern of
+            files, 'surfaces=scans/*.ply'.
+        template: of task=collection_map: a surface as source, which every other is mapped to and
+            from; landmarks are numbered or named as on it.
         landmarks: a JSON file of pairs; or [FILE, FILE], .vts, .txt, .pinned, .bary, .pp or
             .json, one for each surface, or the names of meshes of the catalogue that have some; or
             pairs of vertices [[12, 40], [7, 3]]; a point [x, y, z], or a place [triangle, b0, b1,
-            b2] with barycentric coordinates, stands for the vertex nearest to it; auto, for
-            task=pair_map with two closed meshes of genus 0: landmarks are proposed.
+            b2] with barycentric coordinates, stands for the vertex nearest to it, and -1 or null
+            for a landmark that the surface lacks; a CSV file with a column for each surface; a
+            folder with a file for each surface, of its name; auto, for
+            closed meshes of genus 0: landmarks are proposed, as they are where none are given;
+            []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
+        seams: of task=param: edges along which the mesh is cut, as a list of pairs of vertices or a
+            file of them; lines: the l lines of the OBJ file; uv: the borders of the islands of its
+            texture coordinates. Several charts are flattened one by one and packed into an atlas.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the
             materials of its file. It is baked to the target, as target_textured.obj and .glb; the
             target's own texture, if it has one, to the source.
@@ -463,8 +515,10 @@ class Settings:
     phi: PhiSettings = field(default_factory=PhiSettings)
     source: str | dict[str, Any] | None = None
     target: str | dict[str, Any] | None = None
-    surfaces: list[Any] | None = None
+    surfaces: str | list[Any] | None = None
+    template: str | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
+    seams: str | list[Any] | None = None
     texture: str | None = None
     texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)

@@ -2,13 +2,14 @@
 
 A fenced block names its language. ``python`` blocks are run, ``sh`` blocks are checked line by
 line, all other languages are output or data. The comment ``<!-- not run: REASON -->`` before a
-block excuses it from both.
+block excuses it from both; ``<!-- needs: PACKAGE -->`` does where the package is not installed.
 """
 
 from __future__ import annotations
 
 import re
 import shlex
+from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,8 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 _BLOCK = re.compile(
-    r"^(?:<!-- not run: (?P<reason>[^\n]+?) -->\n+)?^```(?P<language>\w*)\n(?P<text>.*?)^```$",
+    r"^(?:<!-- (?:not run: (?P<reason>[^\n]+?)|needs: (?P<needs>\w+)) -->\n+)?"
+    r"^```(?P<language>\w*)\n(?P<text>.*?)^```$",
     re.DOTALL | re.MULTILINE,
 )
 _FLAGS_WITH_VALUE = {"--cfg", "-c", "--config-dir", "-cd", "--package"}
@@ -45,13 +47,20 @@ def blocks(page: Path, language: str | None = None) -> list[Block]:
             text.count("\n", 0, match.start("text")),
             match["language"],
             match["text"],
-            match["reason"],
+            match["reason"] or _missing(match["needs"]),
         )
         for match in _BLOCK.finditer(text)
     ]
     if language is None:
         return found
     return [block for block in found if block.language == language and block.reason is None]
+
+
+def _missing(package: str | None) -> str | None:
+    """Why a block that needs a package is not run."""
+    if package is None or find_spec(package) is not None:
+        return None
+    return f"needs {package}"
 
 
 def run_python(page: Path, names: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -21,7 +21,10 @@ ROOMS = [
     "pipeline",
 ]
 # what every room may import
-COMMON = {"errors", "instantiation", "optional_dependencies", "settings", "stages"}
+COMMON = {
+    *("errors", "instantiation", "optional_dependencies", "settings"),
+    *("side_by_side", "stages"),
+}
 # rooms that stand for themselves: meshes in numpy, and maps in torch
 INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}
 # a run knows its configuration, its folder, the sweep that it belongs to and the user's modules;

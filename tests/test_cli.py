@@ -98,6 +98,30 @@ def test_a_mistake_is_one_line(here, arguments, named):
     assert len(result.stderr.splitlines()) == 1
 
 
+def test_ctrl_c_is_answered_whenever_it_comes(here, tmp_path, monkeypatch):
+    (tmp_path / "patch.off").write_text(SQUARE)
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nsm.pipeline.overfit.OverfitTask.prepare", stop)
+    result = here(*TRAINING)
+    assert (result.returncode, result.stderr) == (130, "nsm: interrupted\n")
+
+
+def test_the_settings_shown_are_those_of_the_run(here, tmp_path):
+    """What a run stores, with the defaults of what the options name; nothing is run."""
+    (tmp_path / "patch.off").write_text(SQUARE)
+    shown = yaml.safe_load(here("--cfg", "job", *TRAINING, "logger=none").stdout)
+    assert not (tmp_path / "outputs").exists()
+    result = here(*TRAINING, "logger=none", "hydra.run.dir=run")
+    assert result.returncode == 0, result.stderr
+    stored = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    for one in (shown, stored):
+        one.pop("domain"), one["surface"].pop("path")  # made definite by the mesh
+    assert shown == stored
+
+
 def test_flags_may_stand_anywhere(here):
     result = here("seed=1", "--cfg", "job", "trainer.max_steps=3")
     assert result.returncode == 0 and "max_steps: 3" in result.stdout

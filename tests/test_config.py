@@ -33,10 +33,8 @@ FILES = sorted(
 TASKS = {
     ("loss_weights", "param"): "param",
     ("loss_weights", "pair"): "pair_map",
-    ("loss_weights", "paper_pair"): "pair_map",
     ("constraints", "param"): "param",
     ("constraints", "pair"): "pair_map",
-    ("constraints", "paper_pair"): "collection_map",
     ("constraints", "fast_pair"): "pair_map",
     ("experiment", "fast"): "pair_map",
     ("published", "param"): "param",
@@ -147,15 +145,13 @@ def test_it_composes_within_the_callers_hydra_main(tmp_path, monkeypatch):
 
 
 def test_groups_can_be_changed_separately():
-    config = compose_config(["task=pair_map", "data=paper", "loss_weights=paper_pair"])
-    assert (config.data.batch_size, config.sampler.pool) == (4000, 500_000)
-    assert config.constraints.boundary == "exact"
-    assert config.loss_weights.seam == 0
-    config = compose_config(["task=pair_map", "data=paper", "sampler=fresh", "domain=square"])
-    assert (config.data.batch_size, config.sampler.pool) == (4000, None)
+    config = compose_config(["task=pair_map", "data=levels", "sampler=pool", "domain=square"])
+    assert (config.data.points[0], config.sampler.pool) == (2048, 500_000)
     assert config.domain._target_ == "nsm.domains.Square"
-    config = compose_config(["task=pair_map", "constraints=paper_pair", "loss_weights=pair"])
-    assert (config.constraints.boundary, config.loss_weights.seam) == ("penalty", 1e3)
+    config = compose_config(["task=pair_map", "constraints=fast_pair"])
+    assert (config.constraints.multiplier_every, config.loss_weights.seam) == (1, 1e3)
+    config = compose_config(["task=pair_map", "experiment=paper", "constraints=fast_pair"])
+    assert (config.constraints.multiplier_every, config.map.width) == (1, 128)
 
 
 @pytest.mark.parametrize(
@@ -184,78 +180,6 @@ def test_the_surface_group_is_the_catalogue():
     assert files == set(catalogue_names())
     for name in files:
         assert composed([f"surface={name}"])[0].surface.name == name
-
-
-# METHOD, "Published settings"; in each line what the text or the authors' code says
-PAPER = {
-    "activation": {"_target_": "nsm.maps.activations.Softplus", "beta": 1.0},
-    "optimizer._target_": "torch.optim.RMSprop",
-    "optimizer.lr": 1e-4,
-    "optimizer.momentum": 0.9,
-    "scheduler._target_": "nsm.tasks.schedules.SGDR",
-    "encoding._target_": "nsm.maps.encodings.Identity",
-    "map.initialization": "xavier",
-    "map.linear_skip": "none",
-    "trainer.stop_gradient_norm": 0.1,
-    "trainer.stop_norm_of": "sum",
-    "trainer.gradient_clip": None,
-}
-PAPER_MAP = {
-    "map.width": 128,
-    "map.depth": 3,
-    "map.block": "plain",
-    "phi.overrides": ["experiment=paper"],
-    "data.batch_size": 1024,
-    "energy._target_": "nsm.energies.SymmetricDirichlet",
-    "loss_weights.injectivity": 1e2,
-    "loss_weights.triangles": 0,
-    "certification.repair": False,
-}
-PAPER_PAIRS = {
-    **PAPER_MAP,
-    "constraints.boundary": "penalty",
-    "constraints.landmarks": "fixed",
-    "constraints.ramp": 0,
-    "loss_weights.boundary": 1e6,
-    "loss_weights.landmarks": 1e3,
-    "loss_weights.seam": 0,
-    "seam.path": "own",
-    "trainer.max_steps": 80_000,
-}
-PAPER_TASKS = {
-    "overfit": {
-        "map.width": 256,
-        "map.depth": 10,
-        "map.block": "post",
-        "loss_weights.normal": 0.01,
-        "data.batch_size": 4000,
-        "sampler.pool": 500_000,
-        "trainer.max_steps": 50_000,
-    },
-    "param": {**PAPER_MAP, "constraints.boundary": "free", "trainer.max_steps": 50_000},
-    "pair_map": PAPER_PAIRS,
-    "collection_map": PAPER_PAIRS,
-}
-
-
-@pytest.mark.parametrize("task", PAPER_TASKS)
-def test_paper_settings_are_those_of_the_paper(task):
-    config = compose_config([f"task={task}", "experiment=paper"])
-    for key, value in {**PAPER, **PAPER_TASKS[task]}.items():
-        assert (key, OmegaConf.select(config, key, throw_on_missing=True)) == (key, value)
-
-
-@pytest.mark.parametrize("task", ["param", "pair_map", "collection_map"])
-def test_the_surfaces_of_the_papers_maps_are_the_papers(task):
-    config = compose_config([f"task={task}", "experiment=paper"])
-    phi = compose_config(["task=overfit", *config.phi.overrides])
-    assert phi == compose_config(["experiment=paper"])
-
-
-def test_a_setting_on_the_command_line_goes_before_the_papers():
-    config = compose_config(["task=param", "experiment=paper", "map.width=16", "optimizer=adam"])
-    assert config.map.width == 16
-    assert config.optimizer._target_ != "torch.optim.RMSprop"
 
 
 @pytest.mark.parametrize("task", ["param", "pair_map", "collection_map"])
@@ -571,7 +495,8 @@ def test_a_users_own_files(tmp_path, here):
     (folder / "optimizer" / "mine.yaml").write_text("_target_: torch.optim.NAdam\nlr: 0.5\n")
     result = here("--config-dir=conf", "--cfg", "job", "experiment=mine")
     config = yaml.safe_load(result.stdout)
-    assert config["optimizer"] == {"_target_": "torch.optim.NAdam", "lr": 0.5}
+    wanted = {"_target_": "torch.optim.NAdam", "lr": 0.5, "encoding_lr": None}
+    assert config["optimizer"] == wanted
     assert config["trainer"]["max_steps"] == 3
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import nsm
 
@@ -67,10 +68,13 @@ def test_the_run_folder_is_complete(finished):
         "reconstruction.glb",
         "error.png",
         "checkerboard.png",
+        "evolution.png",
         "metrics.json",
     ):
         assert (folder / name).stat().st_size > 0, name
     assert not list(folder.rglob("*.tmp"))
+    with Image.open(folder / "evolution.png") as strip:
+        assert strip.width % strip.height == 0 and strip.width >= 2 * strip.height
 
 
 def test_the_result_is_the_shape(finished):
@@ -103,8 +107,9 @@ def test_load_gives_it_back(finished):
     stored = json.loads((folder / "metrics.json").read_text())["metrics"]
     assert phi.metrics == stored
     vertices = phi(phi.surface.uv)
-    error = np.linalg.norm(vertices - phi.surface.vertices, axis=1)
-    assert error.mean() < 0.05 * phi.surface.bounding_box_diagonal
+    given = phi.in_original_units(phi.surface.vertices)
+    error = np.linalg.norm(vertices - given, axis=1)
+    assert error.mean() < 0.05 * np.linalg.norm(np.ptp(given, axis=0))
 
 
 def test_same_seed_same_result_and_another_differs(tmp_path):

@@ -30,6 +30,7 @@ from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, BLOCKS, NeuralMap, as_activation, build_analytic
 from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
+from nsm.results.metrics import evaluate
 from nsm.results.textured_mesh import TexturedMesh
 from nsm.surfaces import catalogue_names
 from nsm.surfaces.location import Places
@@ -77,6 +78,7 @@ def check_points(function: Callable, array: np.ndarray, columns: int, out: tuple
 def test_functions_of_the_domain(array):
     check_points(NEURAL[0], array, 2, (3,))
     check_points(NEURAL[0].jacobian, array, 2, (3, 2))
+    check_points(lambda uv: NEURAL[0].value_and_jacobian(uv)[0], array, 2, (3,))
     check_points(FLAT, array, 2, (2,))
     check_points(PAIR.planar, array, 2, (2,))
 
@@ -86,6 +88,7 @@ def test_functions_of_the_domain(array):
 def test_functions_of_space(array):
     check_points(PAIR, array, 3, (3,))
     check_points(PAIR.inverse, array, 3, (3,))
+    check_points(lambda p: PAIR.value_and_jacobian(p)[1], array, 3, (3, 3))
     check_points(PAIR.aligned, array, 3, (3,))
     check_points(NEURAL[0].in_original_units, array, 3, (3,))
 
@@ -151,13 +154,54 @@ def test_functions_of_tensors(array):
     if array.dtype.kind == "U":
         return
     tensor = torch.from_numpy(array.copy())
-    for function in (NEURAL[0], NEURAL[0].jacobian):
-        try:
-            result = function(tensor)
-        except NsmError:
-            assert tensor.ndim != 2 or tensor.shape[1] != 2 or not tensor.is_floating_point()
-        else:
-            assert result.dtype == tensor.dtype and len(result) == len(tensor)
+    for columns, functions in (
+        (2, (NEURAL[0], NEURAL[0].jacobian, NEURAL[0].to("cpu"))),
+        (3, (PAIR, PAIR.inverse, PAIR.module(), PAIR.to("cpu"))),
+    ):
+        fits = tensor.ndim == 2 and tensor.shape[1] == columns and tensor.is_floating_point()
+        for function in functions:
+            try:
+                result = function(tensor)
+            except NsmError:
+                assert not fits or columns == 3 and not tensor.isfinite().all()
+            else:
+                assert fits and result.dtype == tensor.dtype and len(result) == len(tensor)
+
+
+@examples(20)
+@given(rows_of(2))
+def test_modules_give_what_their_maps_give(uv):
+    tensor = torch.from_numpy(uv)
+    phi, module = NEURAL[0], NEURAL[0].module()
+    for one, other in zip(
+        module.value_and_jacobian(tensor), phi.value_and_jacobian(tensor), strict=True
+    ):
+        assert torch.equal(one.nan_to_num(), other.nan_to_num())
+    inside = uv[(np.abs(uv) < 2).all(axis=1)]
+    points = phi(inside)
+    given_ = torch.from_numpy(points)
+    assert np.allclose(PAIR.module()(given_).numpy(), PAIR(points), atol=1e-6)
+    assert np.allclose(PAIR.to("cpu")(points), PAIR(points), atol=1e-12)
+
+
+@examples(5)
+@given(st.booleans(), st.sampled_from(["a.glb", "b.GLB", "c.obj", "d"]))
+def test_correspondences_and_morphs_are_on_the_files(tmp_path_factory, back, name):
+    start, end = (PAIR.target, PAIR.source) if back else (PAIR.source, PAIR.target)
+    face, weights = PAIR.correspondences(back=back)
+    vertices, faces = end.file_mesh()
+    assert len(face) == len(weights) == len(start.file_mesh()[0])
+    assert (weights >= 0).all() and np.allclose(weights.sum(axis=1), 1)
+    points = Places(face, weights).take(vertices, faces)
+    expected = (PAIR.inverse if back else PAIR)(start.file_mesh()[0])
+    assert np.allclose(points, expected, atol=1e-6)
+    file = tmp_path_factory.mktemp("morph") / name
+    try:
+        PAIR.export_morph(file)
+    except NsmError as error:
+        assert error.kind == "unknown_format" and not file.exists()
+    else:
+        assert file.suffix.lower() == ".glb" and file.read_bytes()[:4] == b"glTF"
 
 
 @examples(30)
@@ -179,9 +223,9 @@ def test_points_keep_to_the_target_and_units_come_back(uv):
     inside = uv / np.maximum(1, np.linalg.norm(uv, axis=1, keepdims=True))
     assert (np.linalg.norm(PAIR.planar(inside), axis=1) <= 1 + 1e-9).all()
     s = NEURAL[0].surface
-    points = NEURAL[0](inside)
-    back = (NEURAL[0].in_original_units(points) - s.center) * s.scale
-    assert np.allclose(back, points, atol=1e-12)
+    points = evaluate(NEURAL[0].map, inside)
+    assert np.allclose(NEURAL[0].in_original_units(points), NEURAL[0](inside), atol=1e-12)
+    assert np.allclose((NEURAL[0](inside) - s.center) * s.scale, points, atol=1e-12)
 
 
 @examples(40)
@@ -218,6 +262,18 @@ def test_the_matrix_transfers(values):
     assert matrix.min() >= -1e-12
 
 
+@examples(10)
+@given(st.integers(-1, 50) | st.none() | st.floats())
+def test_spectra(count):
+    try:
+        values, functions = NEURAL[0].spectrum(count)
+    except NsmError:
+        assert type(count) is not int or not 1 <= count < VERTICES
+        return
+    assert values.shape == (count,) and functions.shape == (VERTICES, count)
+    assert abs(values[0]) < 1e-6 and (np.diff(values) > -1e-9).all()
+
+
 @examples(30)
 @given(ANY_FLOAT | st.integers(-2, 2) | st.none() | st.text(max_size=2) | st.complex_numbers())
 def test_morph(t):
@@ -228,7 +284,7 @@ def test_morph(t):
         return
     assert vertices.shape == (VERTICES, 3)
     if t == 0:
-        assert (vertices == PAIR.source.surface.vertices).all()
+        assert (vertices == PAIR.source.file_mesh()[0]).all()
 
 
 @examples(20)
@@ -603,6 +659,10 @@ def test_closed_surfaces_of_any_radii(radii, scale):
     surface = Surface.from_arrays(vertices, faces, domain="orbifold")
     first, whole = surface.whole()
     assert np.array_equal(whole, faces)
+    own, corners = surface.file_faces()
+    assert np.array_equal(own, faces) and np.array_equal(surface.source_vertex[corners], faces)
+    kept = NeuralSurface(surface, NEURAL[0].map).file_mesh()
+    assert np.array_equal(kept[0], vertices) and np.array_equal(kept[1], faces)
     assert np.allclose(surface.vertices[first] / surface.scale + surface.center, vertices)
     assert (signed_areas(surface.uv, surface.faces) > 0).all()
     assert math.isclose(signed_areas(surface.uv, surface.faces).sum(), 2.0, rel_tol=1e-9)
@@ -646,6 +706,14 @@ def test_what_is_registered_is_what_is_used(tables, a, b, c):
 PROPERTIES: dict[str, list[Callable]] = {
     "NeuralSurface.__call__": [test_functions_of_the_domain, test_functions_of_tensors],
     "NeuralSurface.jacobian": [test_functions_of_the_domain, test_jacobians_are_differences],
+    "NeuralSurface.file_mesh": [test_closed_surfaces_of_any_radii],
+    "NeuralSurface.module": [test_modules_give_what_their_maps_give],
+    "NeuralSurface.spectrum": [test_spectra],
+    "NeuralSurface.to": [test_functions_of_tensors],
+    "NeuralSurface.value_and_jacobian": [
+        test_functions_of_the_domain,
+        test_modules_give_what_their_maps_give,
+    ],
     "NeuralSurface.in_original_units": [
         test_functions_of_space,
         test_points_keep_to_the_target_and_units_come_back,
@@ -658,6 +726,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "Parameterization.save": [test_what_is_saved_is_what_is_loaded],
     "Surface.arrays": [test_closed_surfaces_of_any_radii],
     "Surface.from_closed": [test_closed_surfaces_of_any_radii],
+    "Surface.file_faces": [test_closed_surfaces_of_any_radii],
     "Surface.whole": [test_closed_surfaces_of_any_radii],
     "Surface.from_arrays": [test_surfaces_of_any_arrays, test_surfaces_of_any_few_triangles],
     "Surface.from_cut": [test_surfaces_of_any_few_triangles],
@@ -682,6 +751,11 @@ PROPERTIES: dict[str, list[Callable]] = {
     "SurfaceMap.transfer": [test_transfer],
     "SurfaceMap.matrix": [test_the_matrix_transfers],
     "SurfaceMap.inverse": [test_functions_of_space],
+    "SurfaceMap.correspondences": [test_correspondences_and_morphs_are_on_the_files],
+    "SurfaceMap.export_morph": [test_correspondences_and_morphs_are_on_the_files],
+    "SurfaceMap.module": [test_functions_of_tensors, test_modules_give_what_their_maps_give],
+    "SurfaceMap.to": [test_functions_of_tensors, test_modules_give_what_their_maps_give],
+    "SurfaceMap.value_and_jacobian": [test_functions_of_space],
     "SurfaceMap.morph": [test_morph],
     "SurfaceMap.aligned": [test_functions_of_space],
     "SurfaceMap.repaired": [test_repaired_maps_are_certified],

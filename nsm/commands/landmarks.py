@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from nsm.arguments import Arguments
 from nsm.commands import add_address
@@ -15,6 +15,7 @@ from nsm.optional_dependencies import needed
 if TYPE_CHECKING:
     from nsm.correspondence.landmark_list import LandmarkList
     from nsm.results.view import EditedShape
+    from nsm.surfaces.validation import Repairs
 
 
 def main(arguments: list[str]) -> None:
@@ -44,6 +45,15 @@ def main(arguments: list[str]) -> None:
         metavar="FILE",
         help="where they are saved; default: %(default)s",
     )
+    parser.add_argument(
+        "--parts",
+        metavar="PART",
+        help="of meshes of several parts: largest, or a number, 0 for the largest area, as "
+        "surface.parts has it",
+    )
+    parser.add_argument(
+        "--repair", choices=["split"], help="cut meshes apart at non-manifold edges"
+    )
     parser.add_argument("--empty", action="store_true", help="begin without landmarks")
     parser.add_argument(
         "--check", action="store_true", help="begin with the coarse map of the landmarks"
@@ -58,11 +68,13 @@ def main(arguments: list[str]) -> None:
             kind="file_exists",
             key=str(given.out),
         )
+    part = _part(given.parts)
     needed("viser", "nsm landmarks", "view")
     # torch takes seconds to import, which --help and wrong options do not need
     from nsm.results.view import LandmarkEditor, running
+    from nsm.surfaces.validation import Repairs
 
-    shapes = [_shape(name) for name in given.mesh]
+    shapes = [_shape(name, Repairs(part, given.repair)) for name in given.mesh]
     landmarks = _start(shapes, given.landmarks, given.empty)
     with running("nsm landmarks", given.host, given.port) as (server, address):
         editor = LandmarkEditor(shapes, landmarks, given.out, server)
@@ -73,7 +85,22 @@ def main(arguments: list[str]) -> None:
             time.sleep(3600)
 
 
-def _shape(name: str) -> EditedShape:
+def _part(given: str | None) -> Literal["largest"] | int | None:
+    """Which part of a mesh is kept."""
+    if given is None:
+        return None
+    if given == "largest":
+        return "largest"
+    if not given.isdecimal():
+        raise NsmError(
+            f"--parts {given}: give largest, or a number from 0",
+            kind="bad_argument",
+            key="--parts",
+        )
+    return int(given)
+
+
+def _shape(name: str, repairs: Repairs) -> EditedShape:
     from nsm.domains import domain
     from nsm.domains.joint_preparation import Mesh
     from nsm.pipeline.resolve_inputs import read_shape
@@ -83,7 +110,7 @@ def _shape(name: str) -> EditedShape:
     mesh = read_shape(name, domain("disc"), "mesh")
     if not isinstance(mesh, Mesh):
         raise NsmError(f"{name}: no mesh; give a mesh file", kind="wrong_type", key=name)
-    cleaned = clean(mesh.vertices, mesh.faces, mesh.name)
+    cleaned = clean(mesh.vertices, mesh.faces, mesh.name, repairs)
     return EditedShape(mesh.name, cleaned.vertices, cleaned.faces, cleaned.source_vertex)
 
 
@@ -117,10 +144,10 @@ def _start(shapes: Sequence[EditedShape], file: Path | None, empty: bool) -> Lan
         return LandmarkList(count, ids, names)
     if empty:
         return LandmarkList(count)
-    from nsm.correspondence.proposal import proposed_for_all
+    from nsm.correspondence import proposed_for_all
 
     try:
-        found = proposed_for_all([(s.vertices, s.faces) for s in shapes])
+        found = proposed_for_all([(s.vertices, s.faces) for s in shapes]).vertices[0]
     except NsmError as error:
         print(f"begins without landmarks: {error}", flush=True)
         return LandmarkList(count)

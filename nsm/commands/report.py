@@ -33,11 +33,17 @@ def main(arguments: list[str]) -> None:
         "-o", "--output", type=Path, default=Path("report.html"), help="default: %(default)s"
     )
     parser.add_argument("--title", default="nsm report", help="default: %(default)s")
+    parser.add_argument(
+        "--up",
+        default="y",
+        choices=["x", "y", "z", "-x", "-y", "-z"],
+        help="the axis of the mesh files that points up, as in --up=-y; default: %(default)s",
+    )
     add_trust(parser)
     given = parser.parse_args(arguments)
     # torch takes seconds to import, which --help and wrong options do not need
     from nsm.results.report import write_report
 
-    runs, incomplete = write_report(given.folders, given.output, given.title, given.trust)
+    runs, incomplete = write_report(given.folders, given.output, given.title, given.trust, given.up)
     others = f", {incomplete} incomplete or damaged" if incomplete else ""
     print(f"{runs} run{'s' if runs != 1 else ''}{others}: {given.output}")

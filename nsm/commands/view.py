@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nsm.arguments import Arguments
 from nsm.commands import add_address, add_trust
+from nsm.errors import NsmError
 from nsm.optional_dependencies import needed
 
 
@@ -32,9 +33,16 @@ def main(arguments: list[str]) -> None:
     needed("viser", "nsm view", "view")
     # torch takes seconds to import, which --help and wrong options do not need
     from nsm.api import load
+    from nsm.results.parameterization_atlas import ParameterizationAtlas
     from nsm.results.view import serving
 
     result = load(given.folder, trust=given.trust)
+    if isinstance(result, ParameterizationAtlas):
+        raise NsmError(
+            f"{given.folder}: an atlas of charts; view one of them, as {given.folder / 'part_0'}",
+            kind="wrong_type",
+            key=str(given.folder),
+        )
     with serving(result, given.host, given.port) as (_, address):
         print(f"{given.folder}: {address} (Ctrl-C ends)", flush=True)
         while True:

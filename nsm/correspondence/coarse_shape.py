@@ -15,6 +15,8 @@ from nsm.surfaces.geometry import edge_graph
 _FACES = 1000
 _TIPS = 8
 _SAMPLES = 64
+_MOST = 9  # tips and given landmarks
+_NEAR = 0.15  # of a tip to a landmark that is given, over √area
 
 
 @dataclass(frozen=True)
@@ -25,19 +27,28 @@ class CoarseShape:
         vertices: (V, 3), about the mean of the surface.
         faces: (F, 3).
         ids: (V,) the vertices of the given mesh that are left.
+        normals: (V, 3) of length one.
         distance: (V, V) geodesic, along edges.
         mean_distance: (V,) to all points of the surface.
-        tips: (K,) vertices far from everything, the most prominent first.
+        tips: (K,) vertices far from everything, the most prominent first; given ones before them.
         samples: (M,) vertices that are spread evenly.
+        given: how many of the tips are landmarks that were given.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     ids: np.ndarray
+    normals: np.ndarray
     distance: np.ndarray
     mean_distance: np.ndarray
     tips: np.ndarray
     samples: np.ndarray
+    given: int = 0
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """The vertices (given,) of landmarks that were given."""
+        return self.tips[: self.given]
 
     def spread_tips(self, count: int) -> np.ndarray:
         """Numbers of up to ``count`` tips that are far from each other."""
@@ -46,13 +57,17 @@ class CoarseShape:
 
 
 def coarse_shape(
-    vertices: np.ndarray, faces: np.ndarray, tips: np.ndarray | None = None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    tips: np.ndarray | None = None,
+    fixed: np.ndarray | None = None,
 ) -> CoarseShape:
     """The coarse shape of a closed mesh (V, 3), (F, 3) of genus 0.
 
     Args:
         vertices, faces: the mesh.
         tips: (K,) vertices that stand for the tips, which are found if not given.
+        fixed: (G,) vertices, landmarks that are given; tips near them are left out.
 
     Raises:
         NsmError: ``wrong_topology`` for any other mesh; ``no_proposal`` for one with fewer than
@@ -69,7 +84,13 @@ def coarse_shape(
             kind="wrong_topology",
             key="landmarks",
         )
-    tips = extremities(vertices, faces, _TIPS) if tips is None else tips
+    given = 0 if fixed is None else len(fixed)
+    if tips is None:
+        tips = extremities(vertices, faces, _TIPS)
+        if fixed is not None and given:
+            unit = np.sqrt(topology.face_areas(vertices, faces).sum())
+            apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
+            tips = np.concatenate([fixed, tips[apart > _NEAR][: _MOST - given]])
     if len(tips) < 4:
         raise NsmError(
             f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",
@@ -87,10 +108,12 @@ def coarse_shape(
         points,
         coarse,
         ids,
+        _normals(points, coarse),
         distance,
         distance @ corner,
         tips,
         _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
+        given,
     )
 
 
@@ -99,6 +122,15 @@ def edge_distances(
 ) -> np.ndarray:
     """Lengths (S, V) of shortest paths along edges, from sources (S,) or from all vertices."""
     return np.asarray(dijkstra(edge_graph(vertices, faces), directed=False, indices=sources))
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 3), means of those of the triangles around weighted by area."""
+    normals = np.zeros_like(vertices)
+    corner = vertices[faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    np.add.at(normals, faces.ravel(), np.repeat(cross, 3, axis=0))
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
 def _spread(distance: np.ndarray, chosen: list[int], count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ class LandmarkList:
 
     Args:
         shapes: how many.
-        lists: vertices (L,) of each shape, to begin with.
+        lists: vertices (L,) of each shape, to begin with; -1 for one that is not placed yet.
         names: of these; numbers by default.
     """
 
@@ -42,7 +42,7 @@ class LandmarkList:
         self._before: list[list[Landmark]] = []
         for k, row in enumerate(zip(*lists, strict=True)):
             name = self._new_name() if names is None else names[k]
-            self.landmarks.append(Landmark(name, tuple(int(v) for v in row)))
+            self.landmarks.append(Landmark(name, tuple(None if v < 0 else int(v) for v in row)))
 
     def place(self, shape: int, vertex: int) -> int:
         """Put a point on a shape: of the first landmark without one there, else of a new one.

@@ -37,12 +37,15 @@ def previewed(
     source: tuple[np.ndarray, np.ndarray],
     target: tuple[np.ndarray, np.ndarray],
     landmarks: tuple[np.ndarray, np.ndarray],
+    drawn: bool = False,
 ) -> Preview:
-    """The coarse map of two closed surfaces of genus 0 through their landmarks.
+    """The coarse map of two closed surfaces of genus 0 through four of their landmarks.
 
     Args:
         source, target: vertices (V, 3) and faces (F, 3).
         landmarks: vertices (L,) of both, four or more.
+        drawn: whether the map is drawn to the other landmarks too, which then tell less of how well
+            they fit.
 
     Raises:
         NsmError: ``too_few_landmarks``, ``wrong_topology``, or ``not_injective`` where four
@@ -76,9 +79,9 @@ def previewed(
     ]
     wanted = np.stack([s.tips[best], t.tips[best]], axis=1)
     starts = [c for c in starts if np.array_equal(c.cones(), wanted)]
-    found = trained(starts, _ROUND)
+    found = trained(starts, _ROUND, np.stack([s.tips, t.tips], axis=1) if drawn else None)
     off = [t.distance[c.images(s.tips), t.tips] for c in found]
     # the isotopy class that other landmarks tell, and distortion
-    costs = [np.log(c.cost) + 4 * miss.mean() for c, miss in zip(found, off, strict=True)]
+    costs = [np.log(c.energy) + 4 * miss.mean() for c, miss in zip(found, off, strict=True)]
     k = int(np.argmin(costs))
-    return Preview(found[k], best, found[k].cost, off[k])
+    return Preview(found[k], best, found[k].energy, off[k])

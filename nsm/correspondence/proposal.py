@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
-from nsm.correspondence.search import Candidate, candidates, distance_change, rigid_residual
+from nsm.correspondence.search import (
+    Candidate,
+    candidates,
+    changes,
+    missed,
+    rigid_residual,
+    turned,
+)
 
-_DISTANCES, _RIGID = 4.0, 2.0  # weights beside the logarithm of the energy
+# weights beside the logarithm of the energy
+_DISTANCES, _RIGID, _TURNED, _MISSED = 4.0, 2.0, 1.0, 4.0
 _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which they are two
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
 _AROUND = 0.3  # a tip's neighbourhood, over √area
-_LEAST_MARGIN = 0.2
-_LARGEST_SCORE = 3.0
+LEAST_MARGIN = 0.2
+LARGEST_SCORE = 3.0
+NONE = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -24,12 +32,16 @@ class Hypothesis:
     """A correspondence that may be the right one.
 
     Attributes:
-        vertices: (L, 2) corresponding vertices of source and target: the four at the cones of the
-            orbifold, then other tips that the map brings near to each other.
-        score: log energy + 4 distance_change + 2 rigid_residual; lower is better.
+        vertices: (L, 2) corresponding vertices of source and target: landmarks that were given;
+            the four at the cones of the orbifold; then other tips that the map brings near to each
+            other.
+        score: log energy + 4 distance_change + 2 rigid_residual + turned + 4 missed; lower is
+            better.
         energy: mean symmetric Dirichlet energy of the coarse map; 4 at isometry.
         distance_change: mean change of geodesic distances, over √area.
         rigid_residual: root mean square distance after the best rigid motion, over √area.
+        turned: mean 1 - cos of the angle between normals after that motion.
+        missed: mean distance, over √area, by which the coarse map misses given landmarks.
         candidate: the coarse map.
     """
 
@@ -38,6 +50,8 @@ class Hypothesis:
     energy: float
     distance_change: float
     rigid_residual: float
+    turned: float
+    missed: float
     candidate: Candidate
 
 
@@ -48,65 +62,79 @@ class Proposal:
     Attributes:
         hypotheses: one or more.
         margin: by how much the score of the second is above that of the first.
+        given: how many landmarks were given; they come first in each hypothesis.
     """
 
     hypotheses: list[Hypothesis]
     margin: float
+    given: int = 0
 
     @property
     def sure(self) -> bool:
         """Whether the first is far ahead of the second, and good in itself."""
-        return self.margin > _LEAST_MARGIN and self.hypotheses[0].score < _LARGEST_SCORE
+        return self.margin > LEAST_MARGIN and self.hypotheses[0].score < LARGEST_SCORE
 
 
 def proposed(
-    source: tuple[np.ndarray, np.ndarray], target: tuple[np.ndarray, np.ndarray]
+    source: tuple[np.ndarray, np.ndarray],
+    target: tuple[np.ndarray, np.ndarray],
+    given: np.ndarray = NONE,
 ) -> Proposal:
     """Propose correspondences of two closed surfaces of genus 0, without reflections.
 
     Args:
         source, target: vertices (V, 3) and faces (F, 3).
+        given: (G, 2) corresponding vertices of both, up to four, which are kept and completed.
 
     Raises:
         NsmError: ``wrong_topology`` or ``no_proposal``, see
-            :func:`nsm.correspondence.coarse_shape.coarse_shape`.
+            :func:`nsm.correspondence.coarse_shape.coarse_shape` and
+            :func:`nsm.correspondence.search.candidates`.
     """
-    found = candidates(coarse_shape(*source), coarse_shape(*target))
+    meshes = (source, target)
+    kept = hypotheses(*(coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)))
+    margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
+    return Proposal(kept, margin, len(given))
+
+
+def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:
+    """Correspondences of two coarse shapes that differ from each other, best first."""
     kept: list[Hypothesis] = []
-    for hypothesis in sorted(map(_hypothesis, found), key=lambda h: h.score):
+    for hypothesis in sorted(map(_hypothesis, candidates(source, target)), key=lambda h: h.score):
         if len(kept) < _KEPT and all(_apart(hypothesis, other) > _DIFFERENT for other in kept):
             kept.append(hypothesis)
-    margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
-    return Proposal(kept, margin)
+    return kept
 
 
-def proposed_for_all(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Landmarks (L, k) of k closed meshes: those proposed for the first and each other one.
-
-    Args:
-        meshes: vertices (V, 3) and faces (F, 3) of each.
-
-    Raises:
-        NsmError: as :func:`proposed`.
-    """
-    pairs = [proposed(meshes[0], other).hypotheses[0].vertices for other in meshes[1:]]
-    common = [v for v in pairs[0][:, 0] if all(v in found[:, 0] for found in pairs)]
-    rows = [[v, *(found[found[:, 0] == v, 1][0] for found in pairs)] for v in common]
-    return np.array(rows, dtype=np.int64).reshape(-1, len(meshes))
+def compared(
+    source: CoarseShape, points: np.ndarray, target: CoarseShape, images: np.ndarray
+) -> float:
+    """The part of the score that corresponding vertices (N,) of two shapes tell alone."""
+    change = changes(source, points, target, images)
+    return _DISTANCES * float(change) + _RIGID * rigid_residual(source, points, target, images)
 
 
 def _hypothesis(candidate: Candidate) -> Hypothesis:
-    change, residual = distance_change(candidate), rigid_residual(candidate)
-    score = float(np.log(candidate.cost)) + _DISTANCES * change + _RIGID * residual
+    s, t = candidate.source.shape, candidate.target.shape
+    images = candidate.images(s.samples)
+    change = float(changes(s, s.samples, t, images))
+    residual = rigid_residual(s, s.samples, t, images)
+    off = float(missed(candidate).mean()) if candidate.source.shape.given else 0.0
+    turn = turned(candidate)
+    score = float(np.log(candidate.energy)) + _DISTANCES * change + _RIGID * residual
+    score += _TURNED * turn + _MISSED * off
     pairs = _matched_tips(candidate)
     ids = candidate.source.shape.ids[pairs[:, 0]], candidate.target.shape.ids[pairs[:, 1]]
-    return Hypothesis(np.stack(ids, axis=1), score, candidate.cost, change, residual, candidate)
+    return Hypothesis(
+        np.stack(ids, axis=1), score, candidate.energy, change, residual, turn, off, candidate
+    )
 
 
 def _matched_tips(candidate: Candidate) -> np.ndarray:
-    """Vertices (L, 2) of the coarse shapes: cones, and tips whose images are mutually nearest."""
+    """Vertices (L, 2) of the coarse shapes: given landmarks, cones, and tips whose images are
+    mutually nearest. None is near a given landmark, which says the same."""
     source, target = candidate.source.shape, candidate.target.shape
-    pairs = candidate.cones()
+    pairs = _away(candidate, candidate.cones())
     ours = np.setdiff1d(_peaks(source), pairs[:, 0])
     theirs = np.setdiff1d(_peaks(target), pairs[:, 1])
     if len(ours) and len(theirs):
@@ -114,8 +142,18 @@ def _matched_tips(candidate: Candidate) -> np.ndarray:
         nearest = apart.argmin(axis=1)
         rows = np.arange(len(ours))
         mutual = (apart.argmin(axis=0)[nearest] == rows) & (apart[rows, nearest] < _NEAR)
-        pairs = np.concatenate([pairs, np.stack([ours, theirs[nearest]], axis=1)[mutual]])
-    return pairs
+        more = np.stack([ours, theirs[nearest]], axis=1)[mutual]
+        pairs = np.concatenate([pairs, _away(candidate, more)])
+    return np.concatenate([np.stack([source.fixed, target.fixed], axis=1), pairs])
+
+
+def _away(candidate: Candidate, pairs: np.ndarray) -> np.ndarray:
+    """Those of pairs (L, 2) of which neither end is near a given landmark."""
+    keep = np.ones(len(pairs), dtype=bool)
+    for k, shape in enumerate((candidate.source.shape, candidate.target.shape)):
+        apart = shape.distance[np.ix_(pairs[:, k], shape.fixed)]
+        keep &= apart.min(axis=1, initial=np.inf) > _NEAR
+    return pairs[keep]
 
 
 def _peaks(shape: CoarseShape) -> np.ndarray:

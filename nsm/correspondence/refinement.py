@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -49,6 +50,36 @@ class Sines:
         return np.stack([sine, cosine * self.waves[:, 0], cosine * self.waves[:, 1]])
 
 
+class Anchors(NamedTuple):
+    """Points that maps of a batch draw together.
+
+    Attributes:
+        points: (G, 2) of the source's Ω.
+        places: (H, G, 2) of each map's target, in any lift.
+        shapes: (H, 2, 2) of each target's plane: distances are those of ``shape @ x``.
+        weight: of the squared distance, beside the energy.
+    """
+
+    points: np.ndarray
+    places: np.ndarray
+    shapes: np.ndarray
+    weight: float
+
+
+class Directions(NamedTuple):
+    """Unit normals that maps of a batch should take to one another.
+
+    Attributes:
+        source: (H, N, 3) at each triangle of the source, turned into the pose of each target.
+        tables: (T, C, C, 3) of the targets, over their grids.
+        weight: of 1 - cos of the angle between them, beside the energy.
+    """
+
+    source: np.ndarray
+    tables: np.ndarray
+    weight: float
+
+
 class Batch:
     """Maps h of one source's layout to targets, x ↦ B (x + n(x)) + c, and their energies.
 
@@ -59,6 +90,8 @@ class Batch:
         matrices: B (H, 2, 2).
         shifts: c (H, 2).
         largest: of the waves.
+        anchors: points that the maps draw together.
+        directions: normals that they take to one another.
     """
 
     def __init__(
@@ -69,6 +102,8 @@ class Batch:
         matrices: np.ndarray,
         shifts: np.ndarray,
         largest: int,
+        anchors: Anchors | None = None,
+        directions: Directions | None = None,
     ) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=torch.float32)
@@ -80,6 +115,43 @@ class Batch:
         self.log_metric = tensor(np.stack([t.log_metric for t in tables]))
         self.number = torch.as_tensor(number)
         self.matrices, self.shifts = tensor(matrices), tensor(shifts)
+        self.weight = 0.0 if anchors is None else anchors.weight
+        if anchors is not None:
+            self.anchor_basis = tensor(Sines.up_to(largest).basis(anchors.points)[0])
+            self.anchors, self.places = tensor(anchors.points), tensor(anchors.places)
+            self.shapes = tensor(anchors.shapes)
+        self.directed = 0.0 if directions is None else directions.weight
+        if directions is not None:
+            self.normals, self.normal_tables = tensor(directions.source), tensor(directions.tables)
+
+    def losses(self, amplitudes: Tensor) -> Tensor:
+        """The energies (H,), and what anchors and directions add to them."""
+        loss = self.energies(amplitudes)
+        if self.weight:
+            loss = loss + self.weight * self.gaps(amplitudes)
+        if self.directed:
+            loss = loss + self.directed * self.turns(amplitudes)
+        return loss
+
+    def turns(self, amplitudes: Tensor) -> Tensor:
+        """Mean 1 - cos (H,) of the angles between normals and those at the images."""
+        basis = self.basis[0][:, : amplitudes.shape[1]]
+        h = self.at + torch.einsum("nk,hkc->hnc", basis, amplitudes)
+        image = torch.einsum("hij,hnj->hni", self.matrices, h) + self.shifts[:, None]
+        off = self._interpolated(self.normal_tables, image) - self.normals
+        return 0.5 * (off**2).sum(dim=-1) @ self.area
+
+    def gaps(self, amplitudes: Tensor) -> Tensor:
+        """Sum (H,) of the squared distances of anchors' images to the nearest lifts of places."""
+        basis = self.anchor_basis[:, : amplitudes.shape[1]]
+        h = self.anchors + torch.einsum("gk,hkc->hgc", basis, amplitudes)
+        image = torch.einsum("hij,hgj->hgi", self.matrices, h) + self.shifts[:, None]
+        squared = []
+        for sign in (1, -1):
+            off = image - sign * self.places
+            off = off - 2 * torch.round(off.detach() / 2)
+            squared.append((torch.einsum("hij,hgj->hgi", self.shapes, off) ** 2).sum(dim=-1))
+        return torch.minimum(*squared).sum(dim=-1)
 
     def energies(self, amplitudes: Tensor) -> Tensor:
         """Mean symmetric Dirichlet energy (H,) of maps with amplitudes (H, K, 2)."""
@@ -87,7 +159,7 @@ class Batch:
         j = stack[1:].permute(1, 2, 3, 0) + torch.eye(2)  # (H, N, 2, 2): component, direction
         h = self.at + stack[0]
         image = torch.einsum("hij,hnj->hni", self.matrices, h) + self.shifts[:, None]
-        metric = _exponential(self._interpolated(image))
+        metric = _exponential(self._interpolated(self.log_metric, image))
         whole = torch.einsum("hij,hnjk->hnik", self.matrices, j)
         pulled = whole.mT @ metric @ whole
         trace = torch.einsum("nij,hnij->hn", self.inverse, pulled)
@@ -100,9 +172,9 @@ class Batch:
         energy = torch.where(large, _CAPPED * (1 + torch.log(energy / _CAPPED)), energy)
         return energy @ self.area
 
-    def _interpolated(self, points: Tensor) -> Tensor:
-        """Logarithms of the metric (H, N, 3) at points (H, N, 2), bilinear in the table."""
-        n = self.log_metric.shape[1]
+    def _interpolated(self, grid: Tensor, points: Tensor) -> Tensor:
+        """Values (H, N, 3) of tables (T, C, C, 3) at points (H, N, 2), bilinear."""
+        n = grid.shape[1]
         t = 0.5 * n * points
         cell = torch.floor(t.detach())
         f = (t - cell)[..., None, :]
@@ -110,23 +182,22 @@ class Batch:
         k, m = (i + 1) % n, (j + 1) % n
         number = self.number[:, None]
         u, v = f[..., 0], f[..., 1]
-        grid = self.log_metric
         near = (1 - v) * grid[number, i, j] + v * grid[number, i, m]
         far = (1 - v) * grid[number, k, j] + v * grid[number, k, m]
         return (1 - u) * near + u * far
 
 
 def refined(batch: Batch, amplitudes: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Lower the energies of all maps of a batch by L-BFGS, each with its own step lengths.
+    """Lower the losses of all maps of a batch by L-BFGS, each with its own step lengths.
 
     Returns:
-        the amplitudes (H, K, 2), and the energies (H,).
+        the amplitudes (H, K, 2), and the losses (H,).
     """
     shape = amplitudes.shape
 
     def evaluated(x: Tensor) -> tuple[Tensor, Tensor]:
         x = x.detach().requires_grad_(True)
-        value = batch.energies(x.view(shape))
+        value = batch.losses(x.view(shape))
         (gradient,) = torch.autograd.grad(value.sum(), x)
         return value.detach(), gradient.nan_to_num()
 

@@ -17,24 +17,32 @@ import torch
 
 from nsm.correspondence.coarse_shape import CoarseShape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
-from nsm.correspondence.refinement import Batch, Sines, refined
+from nsm.correspondence.refinement import Anchors, Batch, Directions, Sines, refined
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
+from nsm.errors import NsmError
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
+_DIRECTED = 40.0  # weight of 1 - cos of the angle between normals, beside the energy
+_HOLD = 50.0  # weight of the squared distance, over the area, by which a map misses a landmark
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of trainings: how many maps, their largest wave, and steps."""
+    """One round of trainings: how many maps, their largest wave, steps, and whether normals count.
+
+    Normals count in the pose that a map gives, so only once it is near its end.
+    """
 
     maps: int
     largest: int
     steps: int
+    directed: bool = False
 
 
-ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40))
+_LAST = Round(16, 8, 20, directed=True)
+ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40), _LAST, _LAST)
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,8 @@ class Candidate:
         matrix, shift: B (2, 2) and c (2,), in coordinates of Ω.
         largest: of the waves of n.
         amplitudes: (K, 2) of the waves.
-        cost: what orders candidates: of the last round the mean symmetric Dirichlet energy.
+        cost: what orders candidates; after a training its loss.
+        energy: after a training, the mean symmetric Dirichlet energy.
     """
 
     source: Layout
@@ -58,6 +67,7 @@ class Candidate:
     largest: int
     amplitudes: np.ndarray
     cost: float
+    energy: float = np.inf
 
     def planar(self, x: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the source's Ω to points (N, 2) of the target's."""
@@ -70,18 +80,30 @@ class Candidate:
 
     def cones(self) -> np.ndarray:
         """The tips at the cones of the source, and those that they go to: (4, 2) vertices."""
+        numbers = self.cone_numbers()
+        tips = self.source.shape.tips[numbers[:, 0]], self.target.shape.tips[numbers[:, 1]]
+        return np.stack(tips, axis=1)
+
+    def cone_numbers(self) -> np.ndarray:
+        """The same as numbers (4, 2) among the tips."""
         image = SIDE * group.CONES @ self.matrix.T + self.shift
         corner = np.mod(np.rint(image).astype(int), 2)
         wanted = np.rint(SIDE * group.CONES).astype(int)
         at = [int(np.flatnonzero((wanted == c).all(axis=1))[0]) for c in corner]
-        ours, theirs = self.source, self.target
-        return np.stack([ours.shape.tips[ours.tips], theirs.shape.tips[theirs.tips[at]]], axis=1)
+        return np.stack([self.source.tips, self.target.tips[at]], axis=1)
 
 
 def candidates(
     source: CoarseShape, target: CoarseShape, rounds: Sequence[Round] = ROUNDS
 ) -> list[Candidate]:
-    """Maps of the source to the target that may be right, least distorted first."""
+    """Maps of the source to the target that may be right, least distorted first.
+
+    Landmarks that are given on both shapes are held: a map does not take one to another tip, and
+    what it misses them by is added to its energy.
+
+    Raises:
+        NsmError: ``no_proposal``: no map meets the landmarks that are given.
+    """
     sets, scores = quick_scores(source)
     ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]])
     theirs = _laid_out(target, _similar_sets(ours, target))
@@ -92,25 +114,47 @@ def candidates(
         for t, looked_up in zip(theirs, tables, strict=True)
         for candidate in _starts(s, t, looked_up)
     ]
+    if not found:
+        raise NsmError(
+            "no map of the surfaces meets the landmarks; give others, or more",
+            kind="no_proposal",
+            key="landmarks",
+        )
+    held = np.stack([source.fixed, target.fixed], axis=1)
     for one in rounds:
-        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one)
+        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held)
     return sorted(found, key=lambda c: c.cost)
 
 
-def distance_change(candidate: Candidate) -> float:
-    """Mean difference of geodesic distances between samples and between their images."""
+def missed(candidate: Candidate) -> np.ndarray:
+    """Distances (G,) from the images of landmarks that are given to where they should be."""
     s, t = candidate.source.shape, candidate.target.shape
-    return float(_changes(s, t, candidate.images(s.samples)))
+    return np.asarray(t.distance[candidate.images(s.fixed), t.fixed])
 
 
-def rigid_residual(candidate: Candidate) -> float:
-    """Root mean square distance of samples, moved rigidly, to their images."""
-    s, t = candidate.source.shape, candidate.target.shape
-    p, q = s.vertices[s.samples], t.vertices[candidate.images(s.samples)]
+def rigid_residual(
+    source: CoarseShape, points: np.ndarray, target: CoarseShape, images: np.ndarray
+) -> float:
+    """Root mean square distance of vertices (N,), moved rigidly, to their images (N,)."""
+    p, q = source.vertices[points], target.vertices[images]
     p, q = p - p.mean(axis=0), q - q.mean(axis=0)
-    left, _, right = np.linalg.svd(p.T @ q)
+    return float(np.sqrt(((p @ pose(p, q) - q) ** 2).sum(axis=1).mean()))
+
+
+def pose(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """The rotation R (3, 3) for which points p R (N, 3), about their mean, are nearest to q."""
+    left, _, right = np.linalg.svd((p - p.mean(axis=0)).T @ (q - q.mean(axis=0)))
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return float(np.sqrt(((p @ left @ flip @ right - q) ** 2).sum(axis=1).mean()))
+    return np.asarray(left @ flip @ right)
+
+
+def turned(candidate: Candidate) -> float:
+    """Mean 1 - cos of the angles between normals at samples, moved rigidly, and at their images."""
+    s, t = candidate.source.shape, candidate.target.shape
+    images = candidate.images(s.samples)
+    turn = pose(s.vertices[s.samples], t.vertices[images])
+    cosine = ((s.normals[s.samples] @ turn) * t.normals[images]).sum(axis=1)
+    return float(1 - cosine.mean())
 
 
 def _laid_out(shape: CoarseShape, sets: np.ndarray) -> list[Layout]:
@@ -122,17 +166,23 @@ def _similar_sets(ours: Sequence[Layout], target: CoarseShape) -> np.ndarray:
     """Sets (S, 4) of the target's tips whose distances are those of one of the source's sets."""
     apart = target.distance[np.ix_(target.tips, target.tips)]
     mean = target.mean_distance[target.tips]
-    orders = np.array(list(permutations(range(len(target.tips)), 4)))
+    every = np.array(list(permutations(range(len(target.tips)), 4)))
     rows, columns = np.triu_indices(4, 1)
     best: dict[tuple[int, ...], float] = {}
     for one in ours:
         shape, tips = one.shape, one.shape.tips[one.tips]
+        orders = every[_agree(one.tips, every, target.given).all(axis=1)]
         wanted = shape.distance[tips[rows], tips[columns]]
         cost = np.abs(wanted - apart[orders[:, rows], orders[:, columns]]).mean(axis=1)
         cost += np.abs(shape.mean_distance[tips] - mean[orders]).mean(axis=1)
         for value, four in zip(cost.tolist(), np.sort(orders, axis=1).tolist(), strict=True):
             best[tuple(four)] = min(best.get(tuple(four), np.inf), value)
-    return np.array(sorted(best, key=lambda four: best[four])[:_TARGET_SETS])
+    return np.array(sorted(best, key=lambda four: best[four])[:_TARGET_SETS]).reshape(-1, 4)
+
+
+def _agree(ours: np.ndarray, theirs: np.ndarray, given: int) -> np.ndarray:
+    """Whether tips, by their numbers, may correspond: a given landmark only to itself."""
+    return np.asarray((ours == theirs) | ((ours >= given) & (theirs >= given)))
 
 
 def _starts(source: Layout, target: Layout, looked_up: Table) -> list[Candidate]:
@@ -142,20 +192,38 @@ def _starts(source: Layout, target: Layout, looked_up: Table) -> list[Candidate]
         Candidate(source, target, looked_up, matrix, shift, 0, nothing, 0.0)
         for matrix, shift in affine_maps(source, target)
     ]
+    given = source.shape.given
+    numbers = [candidate.cone_numbers() for candidate in made]
+    made = [c for c, n in zip(made, numbers, strict=True) if _agree(n[:, 0], n[:, 1], given).all()]
+    if not made:
+        return []
     images = np.stack([candidate.images(source.shape.samples) for candidate in made])
-    costs = _changes(source.shape, target.shape, images)
+    costs = changes(source.shape, source.shape.samples, target.shape, images)
+    if given:
+        costs = costs + np.array([missed(c).mean() for c in made])
     return [replace(c, cost=float(cost)) for c, cost in zip(made, costs, strict=True)]
 
 
-def _changes(source: CoarseShape, target: CoarseShape, images: np.ndarray) -> np.ndarray:
-    """Mean difference (...) of distances between samples and between images (..., M) of them."""
-    before = source.distance[np.ix_(source.samples, source.samples)]
+def changes(
+    source: CoarseShape, points: np.ndarray, target: CoarseShape, images: np.ndarray
+) -> np.ndarray:
+    """Mean difference (...) of geodesic distances between vertices (N,) and between images (..., N)
+    of them."""
+    before = source.distance[np.ix_(points, points)]
     after = target.distance[images[..., :, None], images[..., None, :]]
     return np.asarray(np.abs(before - after).mean(axis=(-1, -2)))
 
 
-def trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
-    """The candidates after a round of trainings; those of one source's layout in one batch."""
+def trained(
+    found: Sequence[Candidate], one: Round, held: np.ndarray | None = None
+) -> list[Candidate]:
+    """The candidates after a round of trainings; those of one source's layout in one batch.
+
+    Args:
+        found: the candidates.
+        one: the round.
+        held: (G, 2) vertices of source and target that are drawn together; none by default.
+    """
     waves = len(Sines.up_to(one.largest).waves)
     by_source: dict[int, list[Candidate]] = {}
     for candidate in found:
@@ -171,15 +239,44 @@ def trained(found: Sequence[Candidate], one: Round) -> list[Candidate]:
             np.stack([c.matrix for c in group_]),
             np.stack([c.shift for c in group_]),
             one.largest,
+            _anchors(group_[0].source, group_, held),
+            _directions(group_[0].source, group_, tables) if one.directed else None,
         )
         start = torch.zeros(len(group_), waves, 2)
         for k, candidate in enumerate(group_):  # few waves come first among many
             start[k, : len(candidate.amplitudes)] = torch.as_tensor(candidate.amplitudes)
-        amplitudes, energies = refined(batch, start, one.steps)
+        amplitudes, _ = refined(batch, start, one.steps)
+        energies, losses = batch.energies(amplitudes), batch.losses(amplitudes)
         result += [
-            replace(c, largest=one.largest, amplitudes=a, cost=e)
-            for c, a, e in zip(
-                group_, amplitudes.numpy().astype(float), energies.tolist(), strict=True
+            replace(c, largest=one.largest, amplitudes=a, energy=e, cost=cost)
+            for c, a, e, cost in zip(
+                group_,
+                amplitudes.numpy().astype(float),
+                energies.tolist(),
+                losses.tolist(),
+                strict=True,
             )
         ]
     return result
+
+
+def _anchors(source: Layout, found: Sequence[Candidate], held: np.ndarray | None) -> Anchors | None:
+    if held is None or not len(held):
+        return None
+    targets = [candidate.target.embedding for candidate in found]
+    shapes = [t.lattice / SIDE / np.sqrt(t.area) for t in targets]
+    places = [t.uv[held[:, 1]] for t in targets]
+    return Anchors(source.embedding.uv[held[:, 0]], np.stack(places), np.stack(shapes), _HOLD)
+
+
+def _directions(source: Layout, found: Sequence[Candidate], tables: Sequence[Table]) -> Directions:
+    """The source's normals in the pose that each candidate gives, and the targets' normals."""
+    shape, target = source.shape, found[0].target.shape
+    normals = shape.normals[shape.faces].mean(axis=1)
+    points = shape.vertices[shape.samples]
+    turned_ = [
+        normals @ pose(points, target.vertices[candidate.images(shape.samples)])
+        for candidate in found
+    ]
+    grids = np.stack([target.normals[one.vertex] for one in tables])
+    return Directions(np.stack(turned_), grids, _DIRECTED)

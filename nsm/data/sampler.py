@@ -27,7 +27,8 @@ class Sampler:
             are not weighted: the share says how much each part of the surface counts. The two
             shares add up to at most 1; the rest of a batch is uniform by area.
         pool: None: draw afresh in each step; a number: draw so many points once, all vertices
-            among them (as published), and pick the batches from these.
+            among them unless each batch has them, and pick the batches from these.
+        every_vertex: all mesh vertices are in each batch, beside its other points.
         stratified: spread the points that are uniform by area evenly, one to each of as many parts
             of equal area.
 
@@ -41,6 +42,7 @@ class Sampler:
         domain_share: Share = 0.0,
         pool: Count | None = None,
         stratified: bool = False,
+        every_vertex: bool = False,
     ) -> None:
         for name, share in (("vertex_share", vertex_share), ("domain_share", domain_share)):
             if not 0 <= share <= 1:
@@ -50,16 +52,24 @@ class Sampler:
         if pool is not None and pool < 1:
             raise ValueError(f"pool {pool} is not at least 1")
         self.vertex_share, self.domain_share, self.pool = vertex_share, domain_share, pool
-        self.stratified = stratified
+        self.stratified, self.every_vertex = stratified, every_vertex
         self.fixed: Samples | None = None
 
     def setup(self, surface: SurfaceSampler, seed: int) -> None:
         """Draw the pool of a surface, if there is to be one."""
         if self.pool is not None:
-            self.fixed = surface.pool(self.pool, surface.generator(seed, -1))
+            points = surface.by_area if self.every_vertex else surface.pool
+            self.fixed = points(self.pool, surface.generator(seed, -1))
 
     def draw(self, surface: SurfaceSampler, count: int, generator: torch.Generator) -> Samples:
-        """``count`` points of a surface."""
+        """``count`` points of a surface, and all its vertices with ``every_vertex``."""
+        samples = self._drawn(surface, count, generator)
+        if self.every_vertex:
+            everywhere = torch.arange(len(surface.vertices), device=surface.device)
+            samples = join(samples, surface.at_vertices(everywhere))
+        return samples
+
+    def _drawn(self, surface: SurfaceSampler, count: int, generator: torch.Generator) -> Samples:
         if self.fixed is not None:
             index = torch.randint(
                 len(self.fixed.uv), (count,), generator=generator, device=surface.device

@@ -92,12 +92,17 @@ class SurfaceSampler:
         if self.has_boundary:
             on = slice(None, None, boundary_every)
             face[on], weights[on] = self._boundary_places(len(face[on]), generator)
-        plane, space = self.uv[self.faces[face]].double(), self.vertices[self.faces[face]].double()
+        return self._at(face, weights), self._jacobians[face]
+
+    @cached_property
+    def _jacobians(self) -> Tensor:
+        """(F, 3, 2) of f: Ω → mesh on each triangle; zero where it has no area in Ω."""
+        plane, space = self.uv[self.faces].double(), self.vertices[self.faces].double()
         sides = torch.stack([plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0]], dim=2)
         edges = torch.stack([space[:, 1] - space[:, 0], space[:, 2] - space[:, 0]], dim=2)
         jacobian = torch.linalg.solve_ex(sides, edges, left=False).result.to(self.vertices.dtype)
         finite = torch.isfinite(jacobian).flatten(1).all(dim=1)[:, None, None]
-        return self._at(face, weights), torch.where(finite, jacobian, 0.0)
+        return torch.where(finite, jacobian, 0.0)
 
     def _boundary_places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Faces (N,) and barycentric weights (N, 3) of points uniform by length on the boundary."""

@@ -158,8 +158,12 @@ class Domain(ABC):
         """Of the lifts of points (N, 2), those (N, 2) in the fundamental domain of a closed Ω."""
         return points
 
-    def lift(self, points: Tensor, near: Tensor) -> Tensor:
-        """The representatives of points (N, 2) of Ω nearest to others (N, 2) in the plane."""
+    def lift(self, points: Tensor, near: Tensor, lattice: np.ndarray | None = None) -> Tensor:
+        """The representatives of points (N, 2) of Ω nearest to others (N, 2) in the plane.
+
+        Args:
+            lattice: (2, 2) of a surface on a closed domain, in whose plane distances are measured.
+        """
         return points
 
     @abstractmethod

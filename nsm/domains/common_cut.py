@@ -27,7 +27,7 @@ from nsm.surfaces.location import locate
 from nsm.surfaces.validation import CleanMesh
 
 # seam=auto tries seams through these shares of the landmarks
-_SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
+SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
 _DISC = Disc()  # where seams are compared, whatever the domain
 _WORST = 1e3  # upper bound on a triangle's distortion
 
@@ -48,6 +48,7 @@ def best_common_cut(
     landmarks: Sequence[np.ndarray],
     seam: str,
     seam_landmarks: int | None,
+    others: Sequence[np.ndarray],
 ) -> CommonCut:
     """Closed genus-0 meshes cut along corresponding seams.
 
@@ -56,6 +57,7 @@ def best_common_cut(
         cleaned: the meshes.
         landmarks: (L,) corresponding vertices of each.
         seam, seam_landmarks: as for :func:`nsm.domains.joint_preparation.prepare_jointly`.
+        others: further vertices of each that no seam may touch.
 
     Raises:
         NsmError: ``no_common_seam``.
@@ -69,18 +71,19 @@ def best_common_cut(
         counts = (
             [seam_landmarks]
             if seam_landmarks
-            else sorted({max(2, round(share * total)) for share in _SHARES})
+            else sorted({max(2, round(share * total)) for share in SHARES})
         )
         ways = list(itertools.product(SEAMS, counts))
         tried = []
         for k, (path, count) in enumerate(ways):
             at("trying seams", k, len(ways))
-            way = _common_cut(names, cleaned, landmarks, path, costs[path], count)
+            way = _common_cut(names, cleaned, landmarks, path, costs[path], count, others)
             if way is not None:
-                tried.append((_disagreement(way, landmarks), k, way))
+                tried.append((disagreement(way, landmarks), k, way))
         best = min(tried, default=(0.0, 0, None))[2]
     else:
-        best = _common_cut(names, cleaned, landmarks, seam, costs[seam], seam_landmarks or total)
+        count = seam_landmarks or total
+        best = _common_cut(names, cleaned, landmarks, seam, costs[seam], count, others)
     if best is None:
         raise NsmError(
             "no seams through the landmarks were found: some are too close together for the "
@@ -98,13 +101,15 @@ def _common_cut(
     seam: str,
     costs: Sequence[np.ndarray],
     count: int,
+    others: Sequence[np.ndarray],
 ) -> CommonCut | None:
     """The meshes cut along one tree through ``count`` landmarks, whose branches are the cheapest
     by costs (E,) of each mesh's edges; None if there is no such tree."""
     pairs = [(c.vertices, c.faces) for c in cleaned]
     chosen = mutually_far(pairs, landmarks, count)
     on_seam = [ids[chosen] for ids in landmarks]
-    paths = corresponding_paths(pairs, on_seam, costs, avoid=landmarks)
+    avoid = [np.concatenate([ids, more]) for ids, more in zip(landmarks, others, strict=True)]
+    paths = corresponding_paths(pairs, on_seam, costs, avoid=avoid)
     if paths is None:
         return None
     cuts = [
@@ -118,7 +123,7 @@ def _common_cut(
     return CommonCut(seam, len(chosen), cuts, [k[:, 1] for k in keys])
 
 
-def _disagreement(way: CommonCut, landmarks: Sequence[np.ndarray]) -> float:
+def disagreement(way: CommonCut, landmarks: Sequence[np.ndarray]) -> float:
     """How badly the domains agree: the distortion of the identity between two domains, times how
     far it misses the landmarks off the seam.
 

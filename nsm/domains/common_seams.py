@@ -117,6 +117,7 @@ def corresponding_paths(
     landmarks: Sequence[np.ndarray],
     costs: Sequence[np.ndarray] | None = None,
     avoid: Sequence[np.ndarray] | None = None,
+    begun: Sequence[tuple[int, int]] = (),
 ) -> list[list[list[int]]] | None:
     """For each mesh, the L - 1 branches of one tree through all of its landmarks.
 
@@ -125,6 +126,8 @@ def corresponding_paths(
         landmarks: (L,) different vertices of each mesh, L at least 2, in the same order.
         costs: (E,) of each edge of :func:`topology.edges_of`, per mesh; by default its length.
         avoid: further vertices of each mesh that no branch may touch.
+        begun: pairs of landmarks that an edge joins on every mesh, in the same cyclic order around
+            each landmark: the first branches.
 
     Returns:
         Per mesh, the branches as lists of vertices; branch b joins the same landmarks everywhere.
@@ -143,6 +146,12 @@ def corresponding_paths(
     heapq.heapify(queue)
     component = list(range(count))
     branches: list[list[list[int]]] = [[] for _ in meshes]
+    for i, j in begun:
+        for tracer, laid in zip(tracers, branches, strict=True):
+            path = [int(tracer.landmarks[i]), int(tracer.landmarks[j])]
+            tracer.add(len(laid), i, j, path)
+            laid.append(path)
+        component = [component[i] if c == component[j] else c for c in component]
     while len(branches[0]) < count - 1:
         if not queue:
             return None
@@ -236,7 +245,7 @@ def edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def boundary_keys(origin: np.ndarray, loop: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
     """(K, 2) int64: the landmark's number, and the cut vertex, of each copy of a landmark on the
     boundary loop (B,), in the loop's order."""
-    number = {int(v): k for k, v in enumerate(landmarks)}
+    number = {int(v): k for k, v in enumerate(landmarks) if v >= 0}
     rows = [(number[o], int(v)) for v in loop if (o := int(origin[v])) in number]
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 

@@ -5,11 +5,13 @@ mesh. SLIM (Rabinovich et al. 2017, "Scalable Locally Injective Mappings") then 
 Dirichlet energy: libigl's with a fixed boundary, which is fast, and after it
 :mod:`nsm.domains.sliding`, whose boundary vertices slide along ∂Ω. The latter keeps the boundary
 exactly on ∂Ω and never flips a triangle, which libigl's soft constraints cannot promise. Large
-meshes are laid out coarse to fine (:mod:`nsm.domains.coarse_to_fine`).
+meshes, and those whose long thin parts exceed floating point in Tutte's embedding, are laid out
+coarse to fine (:mod:`nsm.domains.coarse_to_fine`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,8 +30,10 @@ if TYPE_CHECKING:
 
 # slim_held: SLIM without the sliding steps, a fast estimate of slim
 METHODS = ("tutte", "slim_held", "slim")
+GIVEN = "given"  # texture coordinates of the mesh file (:mod:`nsm.domains.given_layout`)
 # meshes with more faces than LARGE are first decimated to COARSE faces
 LARGE, COARSE = 40_000, 12_000
+FEWER = 8  # a mesh whose Tutte embedding flips triangles is decimated by this factor, or again
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,8 @@ def embed(
     The mesh should have the area of the domain. Keys stay in their places.
 
     Raises:
-        NsmError: ``unknown_option``, an unknown method; ``not_injective``, even Tutte's embedding
-            has flipped triangles in floating point.
+        NsmError: ``unknown_option``, an unknown method; ``not_injective``, Tutte's embedding has
+            flipped triangles in floating point, that of a decimated mesh too.
     """
     check_method(method, name)
     log: list[str] = []
@@ -97,15 +101,42 @@ def embed(
         log.append("SLIM's result was not injective: Tutte's embedding kept")
         return start
 
+    def solve_coarse_to_fine(count: int) -> np.ndarray | None:
+        uv = embed_coarse_to_fine(vertices, faces, loop, boundary, domain, held, solve, count)
+        return uv if uv is not None and _is_injective(uv, faces, loop) else None
+
     uv = None
     if method != "tutte" and len(faces) > LARGE:
-        uv = embed_coarse_to_fine(vertices, faces, loop, boundary, domain, held, solve, COARSE)
-        if uv is None or not _is_injective(uv, faces, loop):
-            uv, log[:] = None, ["coarse-to-fine layout failed: whole mesh laid out at once"]
+        uv = solve_coarse_to_fine(COARSE)
+        if uv is None:
+            log[:] = ["coarse-to-fine layout failed: whole mesh laid out at once"]
     if uv is None:
-        uv = solve(vertices, faces, loop, boundary, held)
+        try:
+            uv = solve(vertices, faces, loop, boundary, held)
+        except NsmError:
+            if method == "tutte":
+                raise
+            # the fewer triangles along a thin part, the better floating point tells them apart
+            uv = _first_that_succeeds(solve_coarse_to_fine, len(faces))
+            if uv is None:
+                raise
+            log[:] = ["long thin parts exceed floating point in Tutte's embedding: coarse to fine"]
     distortion = _median_distortion(vertices, faces, uv)
     return Embedding(uv, distortion, tutte_distortion, tuple(log))
+
+
+def _first_that_succeeds(
+    solve_coarse_to_fine: Callable[[int], np.ndarray | None], count: int
+) -> np.ndarray | None:
+    """The layout of the finest coarse mesh that has one."""
+    while (count := count // FEWER) > FEWER:
+        try:
+            uv = solve_coarse_to_fine(count)
+        except NsmError:
+            continue
+        if uv is not None:
+            return uv
+    return None
 
 
 def _is_injective(uv: np.ndarray, faces: np.ndarray, loop: np.ndarray) -> bool:
@@ -113,8 +144,8 @@ def _is_injective(uv: np.ndarray, faces: np.ndarray, loop: np.ndarray) -> bool:
 
 
 def check_method(method: str, name: str) -> None:
-    """NsmError for a method that is none of :data:`METHODS`."""
-    if method not in METHODS:
+    """NsmError for a method that is none of :data:`METHODS`, nor ``given``."""
+    if method not in (*METHODS, GIVEN):
         raise NsmError(
             f"{name}: unknown parameterization {method!r}; use one of {', '.join(METHODS)}",
             kind="unknown_option",

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from nsm.domains.base import BoundedDomain, Domain, Keys
+from nsm.domains.common_boundaries import best_common_boundaries, needs_common_boundaries
 from nsm.domains.common_cut import best_common_cut, common_fractions
 from nsm.domains.common_seams import aligned_keys, boundary_keys
+from nsm.domains.embedding import GIVEN
 from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
 from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.domains.surface import Surface
 from nsm.errors import NsmError
-from nsm.stages import counted
+from nsm.side_by_side import at_once, side_by_side
+from nsm.stages import at, counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
+from nsm.surfaces.cutting import Cut
+from nsm.surfaces.landmarks import MISSING
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 
@@ -43,38 +50,58 @@ def prepare_jointly(
     seam_landmarks: int | None = None,
     cache: bool = True,
     repairs: Repairs = NO_DECISION,
+    processes: int | None = 1,
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
     For a domain with boundary, closed genus-0 meshes with two landmarks or more are cut along
-    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. On
+    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. So
+    are open ones with several boundaries; boundaries that correspond have the same places then. On
     the orbifold, meshes with four landmarks or more get the same four as their cones, those whose
     domains are least distorted in the mean. Other meshes are prepared one by one.
 
     Args:
         meshes: two or more.
-        landmarks: (L,) vertices of each, in the same order.
+        landmarks: (L,) vertices of each, in the same order; -1 for one that a mesh lacks.
         domain, parameterization, cache, repairs: as for :meth:`Surface.load`.
         seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
             ``auto``, which tries both and keeps the seam for which the domains agree best; or
             ``own``: each mesh is cut by itself.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
             all of them, or, with ``auto``, the number for which the domains agree best.
+        processes: how many meshes are laid out at once, as for
+            :func:`nsm.side_by_side.side_by_side`.
 
     Raises:
         NsmError: a mesh that cannot be prepared; ``wrong_topology`` if genus or number of boundary
             loops differ; ``no_common_seam``.
     """
     domain = domain_of(domain)
+    if parameterization == GIVEN:
+        raise NsmError(
+            "surface.parameterization=given: the meshes of a map are laid out alike; take slim",
+            kind="unknown_option",
+            key="surface.parameterization",
+        )
     cleaned = [clean(m.vertices, m.faces, m.name, repairs) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
-    enough = len(found[0]) >= 2 if domain.has_boundary else len(distinct(found)) >= 4
-    apart = seam == "own" and domain.has_boundary
+    everywhere: np.ndarray = np.all(np.stack(found) >= 0, axis=0)
+    common_ids = [ids[everywhere] for ids in found]
+    enough = everywhere.sum() >= 2 if domain.has_boundary else len(distinct(common_ids)) >= 4
+    apart = (seam == "own" and domain.has_boundary) or len(meshes) == 1
     kinds = [topology.genus_and_boundary(c.faces) for c in cleaned]
     common = check_common_topology([m.name for m in meshes], kinds)
-    if common != (0, 0) or not enough or apart:
-        return [
-            Surface.from_arrays(
+    genus, loops = common
+    several = (
+        domain.has_boundary
+        and loops > 0
+        and genus == 0
+        and needs_common_boundaries(cleaned, common_ids[0])
+    )
+    if apart or not several and (common != (0, 0) or not enough):
+
+        def alone(m: Mesh) -> Surface:
+            return Surface.from_arrays(
                 m.vertices,
                 m.faces,
                 name=m.name,
@@ -84,8 +111,8 @@ def prepare_jointly(
                 log=m.log,
                 repairs=repairs,
             )
-            for m in counted("layout on the domain", meshes)
-        ]
+
+        return _laid_out(alone, list(zip(meshes)), processes)
     digest = hashlib.sha256()
     for c, ids in zip(cleaned, found, strict=True):
         for array in (c.vertices, c.faces, ids):
@@ -103,20 +130,34 @@ def prepare_jointly(
         stored = [cache_.read(key) for key in names]
         if all(s is not None for s in stored):
             return [
-                Surface.from_stored(m.name, domain, s)
+                replace(Surface.from_stored(m.name, domain, s), raw=(m.vertices, m.faces))
                 for m, s in zip(meshes, stored, strict=True)
                 if s is not None
             ]
     if domain.has_boundary:
-        surfaces = _cut_and_embed(
-            meshes, cleaned, found, domain, parameterization, seam, seam_landmarks
-        )
+        number = int(digest.hexdigest()[:15], 16)
+        how = (domain, parameterization, seam, seam_landmarks)
+        one, parts = _cut_alike(meshes, cleaned, found, everywhere, *how, number)
     else:
-        surfaces = _with_common_cones(meshes, cleaned, found, domain, parameterization)
+        one, parts = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization)
+    surfaces = _laid_out(one, parts, processes)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
             cache_.write(key, surface.to_stored())
-    return surfaces
+    return [
+        replace(surface, raw=(m.vertices, m.faces))
+        for m, surface in zip(meshes, surfaces, strict=True)
+    ]
+
+
+def _laid_out(
+    one: Callable[..., Surface], parts: Sequence[tuple[Any, ...]], processes: int | None
+) -> list[Surface]:
+    """The surfaces of meshes, each laid out by a call with its part, several at once."""
+    if at_once(len(parts), processes) < 2:
+        return [one(*part) for part in counted("layout on the domain", parts)]
+    at("layout on the domain")
+    return side_by_side([partial(one, *part) for part in parts], processes)
 
 
 def _with_common_cones(
@@ -125,14 +166,16 @@ def _with_common_cones(
     landmarks: Sequence[np.ndarray],
     domain: Domain,
     method: str,
-) -> list[Surface]:
+) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
+    """What lays out a mesh, and its arguments for each."""
     numbers, score = choose_common_cones([(c.vertices, c.faces) for c in cleaned], landmarks)
     line = (
         f"cones at landmarks {numbers.tolist()}, counted from 0, the same on all meshes: mean log "
         f"distortion {score:.3f}"
     )
-    return [
-        Surface.from_closed(
+
+    def one(m: Mesh, c: CleanMesh, ids: np.ndarray) -> Surface:
+        return Surface.from_closed(
             c,
             name=m.name,
             domain=domain,
@@ -140,8 +183,8 @@ def _with_common_cones(
             cones=ids[numbers].tolist(),
             log=(*m.log, *c.log, line),
         )
-        for m, c, ids in zip(meshes, cleaned, landmarks, strict=True)
-    ]
+
+    return one, list(zip(meshes, cleaned, landmarks, strict=True))
 
 
 def check_common_topology(
@@ -154,10 +197,19 @@ def check_common_topology(
     """
     for name, (genus, loops) in zip(names, found, strict=True):
         if (genus, loops) != found[0]:
+            if genus == found[0][0] and 0 in (loops, found[0][1]):
+                open_, closed = (name, names[0]) if loops else (names[0], name)
+                raise NsmError(
+                    f"{open_} has a boundary and {closed} has none: maps take whole surfaces to "
+                    f"whole ones, not a part into a whole; close the holes of {open_}, or cut from "
+                    f"{closed} the part that corresponds",
+                    kind="wrong_topology",
+                    key=name,
+                )
             raise NsmError(
                 f"{name} has genus {genus} and {loops} boundary loops, {names[0]} genus "
-                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes or "
-                "remove handles until they agree",
+                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes, as "
+                "surface.fill_holes=true does with small ones, or remove handles until they agree",
                 kind="wrong_topology",
                 key=name,
             )
@@ -165,10 +217,10 @@ def check_common_topology(
 
 
 def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
-    """Landmarks as vertices of the cleaned mesh."""
-    kept = mesh.merged[landmarks]
+    """Landmarks as vertices of the cleaned mesh; -1 for those that it lacks."""
+    kept = np.where(landmarks >= 0, mesh.merged[landmarks], MISSING)
     for given, vertex in zip(landmarks, kept, strict=True):
-        if vertex < 0:
+        if vertex < 0 <= given:
             raise NsmError(
                 f"{name}: landmark {given} is not on the surface; give another vertex",
                 kind="not_on_surface",
@@ -177,44 +229,82 @@ def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
     return kept
 
 
-def _cut_and_embed(
+def _cut_alike(
     meshes: Sequence[Mesh],
     cleaned: Sequence[CleanMesh],
     landmarks: Sequence[np.ndarray],
+    everywhere: np.ndarray,
     domain: Domain,
     method: str,
     seam: str,
     seam_landmarks: int | None,
-) -> list[Surface]:
+    number: int,
+) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
+    """As :func:`_with_common_cones`, for a domain with boundary: the meshes are cut through
+    landmarks that all have, mask (L,), and past all others."""
     names = [m.name for m in meshes]
-    best = best_common_cut(names, cleaned, landmarks, seam, seam_landmarks)
+    common = [ids[everywhere] for ids in landmarks]
+    others = [ids[~everywhere & (ids >= 0)] for ids in landmarks]
+    what = names, cleaned, common, seam, seam_landmarks, others
+    ends: Sequence[np.ndarray | None] = [None] * len(meshes)
+    said: list[tuple[str, ...]] = [()] * len(meshes)
+    if topology.boundary_loops(cleaned[0].faces):
+        best, found, lines = best_common_boundaries(*what)
+        own = zip(cleaned, found, strict=True)
+        ends = [np.array([number, *c.source_vertex[vertices]]) for c, vertices in own]
+        said = [(line,) for line in lines]
+    else:
+        best = best_common_cut(*what)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     line = (
-        f"seam led along {best.seam} paths through {best.count} of {len(landmarks[0])} landmarks, "
+        f"seam led along {best.seam} paths through {best.count} of {len(common[0])} landmarks, "
         "the same on all meshes"
     )
-    return [
-        Surface.from_cut(
+
+    def one(
+        m: Mesh,
+        c: CleanMesh,
+        cut: Cut,
+        key: np.ndarray,
+        end: np.ndarray | None,
+        more: tuple[str, ...],
+    ) -> Surface:
+        surface = Surface.from_cut(
             cut,
             c,
             name=m.name,
             domain=domain,
             parameterization=method,
             keys=Keys(key, fractions),
-            log=(*m.log, *c.log, line),
+            log=(*m.log, *c.log, *more, line),
         )
-        for m, c, cut, key in counted(
-            "layout on the domain",
-            list(zip(meshes, cleaned, best.cuts, best.keys, strict=True)),
-        )
-    ]
+        return replace(surface, ends=end)
+
+    return one, list(zip(meshes, cleaned, best.cuts, best.keys, ends, said, strict=True))
+
+
+def with_ends(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Landmarks (L,) of surfaces, and after them the corresponding vertices (L + J,) at which the
+    cuts end on the boundaries, if the surfaces were cut together."""
+    ends = [s.ends[1:] for s in surfaces if s.ends is not None]
+    if not cut_together(surfaces) or not ends:
+        return list(landmarks)
+    known = np.any([np.isin(e, ids) for e, ids in zip(ends, landmarks, strict=True)], axis=0)
+    return [np.concatenate([ids, e[~known]]) for ids, e in zip(landmarks, ends, strict=True)]
+
+
+def cut_together(surfaces: Sequence[Surface]) -> bool:
+    """Whether the cuts between the boundaries of open surfaces correspond."""
+    numbers = {None if s.ends is None else int(s.ends[0]) for s in surfaces}
+    return len(numbers) == 1 and None not in numbers
 
 
 @dataclass(frozen=True)
 class Matched:
     """Landmarks found in the domains of several surfaces.
 
-    points: (K, 2) in Ω, one array per surface; numbers: (K,) which landmark each is. The first
+    points: (K, 2) in Ω, one array per surface, NaN for a landmark that the surface lacks; numbers:
+    (K,) which landmark each is. The first
     ``on_boundary`` lie on ∂Ω, in the order in which it is walked counter-clockwise; a landmark on
     the seam is there once for each time that the walk passes it.
     """
@@ -222,6 +312,10 @@ class Matched:
     points: list[np.ndarray]
     numbers: np.ndarray
     on_boundary: int
+
+    def shared(self, i: int, j: int) -> np.ndarray:
+        """Mask (K,) of the landmarks that two surfaces have."""
+        return np.asarray(np.isfinite(self.points[i] + self.points[j]).all(axis=1))
 
     def seam(self, domain: BoundedDomain, count: int) -> np.ndarray:
         """(T, 2, 2) pairs of points of ∂Ω that are one point of each surface with this seam.
@@ -257,18 +351,28 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
 
     Args:
         surfaces: all of one domain.
-        landmarks: vertices (L,) of each one's mesh file.
+        landmarks: vertices (L,) of each one's mesh file; -1 for one that a surface lacks.
 
     Raises:
-        NsmError: a landmark that a surface does not have, or boundaries that do not correspond.
+        NsmError: a landmark that is not on its surface, or boundaries that do not correspond.
     """
     if not surfaces[0].domain.has_boundary:
-        points = [s.preimages(ids.tolist()) for s, ids in zip(surfaces, landmarks, strict=True)]
+        points = [_places(s, ids) for s, ids in zip(surfaces, landmarks, strict=True)]
         return Matched(points, np.arange(len(landmarks[0])), 0)
-    keys = [
-        boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], s.kept(ids.tolist()))
-        for s, ids in zip(surfaces, landmarks, strict=True)
-    ]
+    everywhere: np.ndarray = np.all(np.stack(landmarks) >= 0, axis=0)
+    keys = []
+    for s, ids in zip(surfaces, landmarks, strict=True):
+        kept = np.full(len(ids), MISSING)
+        kept[ids >= 0] = s.kept(ids[ids >= 0].tolist())
+        key = boundary_keys(s.source_vertex, topology.boundary_loops(s.faces)[0], kept)
+        for k in key[~everywhere[key[:, 0]], 0][:1].tolist():
+            raise NsmError(
+                f"landmark {k} is on the boundary of {s.name}, or on its cut, and other surfaces "
+                "lack it; leave it out, or move it off the boundary",
+                kind="no_common_seam",
+                key="landmarks",
+            )
+        keys.append(key)
     aligned = aligned_keys(keys)
     if aligned is None:
         names = " and ".join(s.name for s in surfaces)
@@ -280,7 +384,14 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
         )
     inner = np.setdiff1d(np.arange(len(landmarks[0])), keys[0][:, 0])
     points = [
-        np.concatenate([s.uv[key[:, 1]], s.preimages(ids[inner].tolist())])
+        np.concatenate([s.uv[key[:, 1]], _places(s, ids[inner])])
         for s, key, ids in zip(surfaces, aligned, landmarks, strict=True)
     ]
     return Matched(points, np.concatenate([aligned[0][:, 0], inner]), len(aligned[0]))
+
+
+def _places(surface: Surface, ids: np.ndarray) -> np.ndarray:
+    """Points (L, 2) of Ω of vertices (L,) of the mesh file; NaN for those that it lacks."""
+    points = np.full((len(ids), 2), np.nan)
+    points[ids >= 0] = surface.preimages(ids[ids >= 0].tolist())
+    return points

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,21 +15,24 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.base import Domain, Keys
-from nsm.domains.embedding import check_method
+from nsm.domains.embedding import GIVEN, check_method
+from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given
+from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
-from nsm.surfaces import topology
-from nsm.surfaces.cutting import Cut, cut_to_disc, first_copies, seam_pairs
+from nsm.surfaces import holes, topology
+from nsm.surfaces.cutting import Cut, chords_joined, cut_to_disc, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
 from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays
+from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
-OPTIONAL = ("lattice",)
+OPTIONAL = ("lattice", "ends")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +49,8 @@ class Surface:
         faces: (F, 3) int64, counter-clockwise in Ω.
         uv: (V, 2) float64 in Ω, or near it on a closed domain, without flipped triangles.
         domain: Ω.
-        source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points.
+        source_vertex: (V,) int64, the vertex of the mesh file, or -1 for inserted points; -2, -3,
+            ... in the middle of each hole that was filled.
         cut_vertex: (W,) int64, for each vertex of the mesh file its first copy here (or that of
             the vertex it was merged with); -1 if it is not on the surface.
         seam_pairs: (T, 2) int64, pairs of vertices that are copies of one point of the mesh.
@@ -54,8 +59,11 @@ class Surface:
         log: repairs, conversions and cuts, a line each.
         lattice: (2, 2) on a closed domain: the surface is least distorted in the plane of
             (lattice / 2) uv, where it has the area of Ω. None elsewhere.
+        ends: of open meshes cut together, (1 + J,) int64: a number that is the same for all of
+            these, and the vertices of the mesh file at which the cuts end on the boundaries, which
+            correspond. None elsewhere.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
-            a surface of a run folder.
+            an analytic surface, and for one that an older version stored.
     """
 
     name: str
@@ -71,6 +79,7 @@ class Surface:
     quality: dict[str, float] = field(default_factory=dict, repr=False)
     log: tuple[str, ...] = field(default=(), repr=False)
     lattice: np.ndarray | None = field(default=None, repr=False)
+    ends: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @classmethod
@@ -96,7 +105,8 @@ class Surface:
             cones: for ``domain="orbifold"``, the four vertices (numbers in the file) at its cones,
                 in the order of (0, 0), (1, 0), (1, 1), (0, 1); by default extremities for which the
                 surface is least distorted.
-            parameterization: ``slim`` or ``tutte``; closed domains have ``slim`` only.
+            parameterization: ``slim`` or ``tutte``, or ``given``: the file's texture coordinates;
+                closed domains have ``slim`` only.
             cache: keep the prepared surface on disk, keyed by content.
             repairs: decisions on a mesh that is not one manifold.
 
@@ -110,6 +120,8 @@ class Surface:
                 key="path_or_name",
             )
         mesh = given_mesh(path_or_name, "path_or_name")
+        file = path_or_name if isinstance(path_or_name, (str, Path)) else ""
+        uv = read_uv(file) if parameterization == GIVEN and Path(file).is_file() else None
         return cls.from_arrays(
             mesh.vertices,
             mesh.faces,
@@ -121,6 +133,7 @@ class Surface:
             cache=cache,
             log=mesh.log,
             repairs=repairs,
+            uv=uv,
         )
 
     @classmethod
@@ -137,10 +150,12 @@ class Surface:
         cache: bool = False,
         log: Sequence[str] = (),
         repairs: Repairs = NO_DECISION,
+        uv: np.ndarray | None = None,
     ) -> Surface:
         """Validate, cut, normalise and parameterise a mesh (V, 3), (F, 3).
 
-        The arguments are those of :meth:`load`. ``quality`` holds flipped_triangles,
+        The arguments are those of :meth:`load`; ``uv`` (F, 3, 2) are texture coordinates at the
+        faces' corners, for ``parameterization="given"``. ``quality`` holds flipped_triangles,
         median_symmetric_dirichlet (of the map from Ω to the mesh) and seconds; on a domain with
         boundary also boundary_self_intersections, tutte_median_symmetric_dirichlet (for large
         meshes, Tutte's of the coarse mesh) and seam_vertices (the number of ``seam_pairs``). No
@@ -169,6 +184,9 @@ class Surface:
             options["cones"] = corners
         if repairs != NO_DECISION:
             options["repairs"] = asdict(repairs)
+        if parameterization == GIVEN:
+            given_uv = check_given(uv, faces, domain, seam, name)
+            options["uv"] = hashlib.sha256(given_uv.tobytes()).hexdigest()
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         raw = (vertices, faces)
@@ -181,7 +199,11 @@ class Surface:
             "parameterization": parameterization,
             "log": (*log, *mesh.log),
         }
-        if domain.has_boundary:
+        if parameterization == GIVEN:
+            assert uv is not None
+            cut, flat = cut_as_given(mesh, faces, uv, name)
+            surface = cls.from_cut(cut, mesh, **about, given=flat)
+        elif domain.has_boundary:
             if seam is not None:
                 seam = _merged(seam, mesh, name, "seam_vertices")
             cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
@@ -205,6 +227,7 @@ class Surface:
         parameterization: str = "slim",
         keys: Keys | None = None,
         log: Sequence[str] = (),
+        given: np.ndarray | None = None,
     ) -> Surface:
         """Normalise and parameterise a mesh that is a disc already.
 
@@ -212,6 +235,7 @@ class Surface:
             cut: the disc, with the vertices of the whole mesh that its own came from.
             mesh: the whole mesh.
             keys: boundary vertices held at given places of ∂Ω.
+            given: (V, 2) the disc in the plane, from which its layout starts.
             name, domain, parameterization, log: as for :meth:`from_arrays`.
 
         Raises:
@@ -221,7 +245,11 @@ class Surface:
         domain = domain_of(domain)
         centred, center, scale = _centred(cut.vertices, cut.faces, domain)
         normalised = centred * scale
-        flat = domain.embed(normalised, cut.faces, method=parameterization, name=name, keys=keys)
+        if given is None:
+            how: dict[str, Any] = {"method": parameterization, "name": name, "keys": keys}
+            flat = domain.embed(normalised, cut.faces, **how)
+        else:
+            flat = embedded_as_given(bounded(domain), cut, given, name)
         flipped = flipped_triangles(flat.uv, cut.faces)
         crossings = boundary_self_intersections(flat.uv, cut.loop) if domain.has_boundary else 0
         if flipped or crossings:
@@ -339,10 +367,44 @@ class Surface:
 
         Returns:
             the first copies (W,) of the mesh file's vertices, in its order, without those that
-            were removed; and faces (F, 3) of numbers among these.
+            were removed, and then those in filled holes; and faces (F, 3) of numbers among these.
         """
-        _, first, number = np.unique(self.source_vertex, return_index=True, return_inverse=True)
+        source, last = self.source_vertex, int(self.source_vertex.max())
+        order = np.where(source < 0, last - source, source)
+        _, first, number = np.unique(order, return_index=True, return_inverse=True)
         return first, number.reshape(-1)[self.faces]
+
+    def file_faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """The faces before copies were made and points inserted, without filled holes.
+
+        Returns:
+            Faces (G, 3) of vertices of the mesh file, and the same (G, 3) of vertices here.
+        """
+        corners = chords_joined(self.faces, self.source_vertex == -1)[0]
+        corners = corners[(self.source_vertex[corners] >= 0).all(axis=1)]
+        return self.source_vertex[corners], corners
+
+    @property
+    def filled(self) -> np.ndarray:
+        """Mask (F,) of the faces over holes that were filled."""
+        if self.source_vertex.min() > holes.FIRST:
+            return np.zeros(len(self.faces), dtype=bool)
+        joined, _, number = chords_joined(self.faces, self.source_vertex == -1)
+        return np.asarray((self.source_vertex[joined] <= holes.FIRST).any(axis=1)[number])
+
+    def shown(self) -> tuple[np.ndarray, np.ndarray]:
+        """What files have of the mesh: vertices (W,), and faces (F, 3) of numbers among them.
+
+        Those of the cut mesh, or, on a closed domain, of :meth:`whole`, without filled holes.
+        """
+        vertices, faces = np.arange(len(self.vertices)), self.faces
+        if not self.domain.has_boundary:
+            vertices, faces = self.whole()
+        filled = self.filled
+        if not filled.any():
+            return vertices, faces
+        used, number = topology.renumbered(faces[~filled], len(vertices))
+        return vertices[used], number[faces[~filled]]
 
     @property
     def topology(self) -> tuple[int, int]:

@@ -1,4 +1,5 @@
-"""Energies: pure functions of Jacobians, metrics or points to one value per sample."""
+"""Energies: pure functions of Jacobians, metrics or points to one value per sample; and the
+differential geometry of a surface."""
 
 from nsm.energies.constraints import boundary, injectivity, inside, landmark, outside, unfold
 from nsm.energies.distortion import (
@@ -13,6 +14,17 @@ from nsm.energies.distortion import (
     symmetric_dirichlet,
 )
 from nsm.energies.metrics import Invariants, first_fundamental_form, pullback_invariants
+from nsm.energies.operators import (
+    Curvatures,
+    area_element,
+    curvatures,
+    jacobian,
+    laplace_beltrami,
+    normals,
+    second_derivatives,
+    second_fundamental_form,
+    surface_gradient,
+)
 from nsm.energies.overfit import normal, position
 from nsm.energies.procrustes import rotation
 from nsm.energies.registry import (
@@ -31,40 +43,51 @@ from nsm.energies.registry import (
     SymmetricDirichlet,
     call_energy,
 )
+from nsm.energies.spectrum import spectrum
 
 __all__ = [
     "ARAP",
-    "ENERGIES",
-    "MIPS",
     "Area",
     "At",
     "Blend",
     "Conformal",
+    "Curvatures",
     "Dirichlet",
+    "ENERGIES",
     "Energy",
     "EquiarealConformal",
     "Invariants",
+    "MIPS",
     "SingularValueRatio",
     "SymmetricARAP",
     "SymmetricDirichlet",
     "arap",
     "area",
+    "area_element",
     "boundary",
     "call_energy",
     "conformal",
+    "curvatures",
     "dirichlet",
     "equiareal_conformal",
     "first_fundamental_form",
     "injectivity",
     "inside",
+    "jacobian",
     "landmark",
+    "laplace_beltrami",
     "mips",
     "normal",
+    "normals",
     "outside",
     "position",
     "pullback_invariants",
     "rotation",
+    "second_derivatives",
+    "second_fundamental_form",
     "singular_value_ratio",
+    "spectrum",
+    "surface_gradient",
     "symmetric_arap",
     "symmetric_dirichlet",
     "unfold",

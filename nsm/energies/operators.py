@@ -1,21 +1,23 @@
 """Differential geometry of a surface φ: Ω → R³, from its derivatives by forward-mode AD.
 
 Nothing is discretized: second derivatives come from φ itself, so φ must have continuous ones. A
-feature grid needs degree 3 (``encoding.degree=3``), and an activation must be smooth: with ReLU
-every curvature is zero almost everywhere. Give φ and uv in float64 for curvatures; float32 leaves
-three or four digits of them.
+feature grid needs degree 3 (``encoding.degree=3``); one of degree 2 is warned of. An activation
+must be smooth: with ReLU every curvature is zero almost everywhere. Give φ and uv in float64 for
+curvatures; float32 leaves three or four digits of them.
 
-φ is any map of points (N, 2) to (N, 3) that treats each point alone, such as the ``map`` of a
-neural surface, and all operators stay differentiable in uv and in the weights of φ.
+φ is any map of points (N, 2) to (N, 3) that treats each point alone, such as the ``module()`` of a
+neural surface, which gives the units of its file. All operators stay differentiable in uv and in
+the weights of φ.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.func import jvp
 
 from nsm.energies.metrics import first_fundamental_form
@@ -70,6 +72,7 @@ def second_derivatives(phi: Map, uv: Tensor) -> Tensor:
         ValueError: as :func:`jacobian`.
     """
     _check(uv)
+    _check_degree(phi)
     first, second = _axes(uv)
     along = _along(phi, first)
     uu, uv_mixed = _along(along, first)(uv), _along(along, second)(uv)
@@ -171,6 +174,7 @@ def laplace_beltrami(phi: Map, f: Map, uv: Tensor) -> Tensor:
         ValueError: as :func:`surface_gradient`.
     """
     _check(uv)
+    _check_degree(phi)
 
     def flux(x: Tensor) -> Tensor:
         metric = first_fundamental_form(_in_space(jacobian(phi, x)))
@@ -188,6 +192,18 @@ def laplace_beltrami(phi: Map, f: Map, uv: Tensor) -> Tensor:
 def _check(uv: Tensor) -> None:
     if uv.ndim != 2 or uv.shape[1] != 2 or not uv.is_floating_point():
         raise ValueError(f"points of Ω are (N, 2) floats, not {tuple(uv.shape)} of {uv.dtype}")
+
+
+def _check_degree(phi: Map) -> None:
+    """Warn of a feature grid whose second derivatives jump from cell to cell."""
+    network = getattr(phi, "map", phi)  # a neural surface's
+    parts = network.modules() if isinstance(network, nn.Module) else ()
+    if any(getattr(part, "degree", None) == 2 for part in parts):
+        warnings.warn(
+            "second derivatives of a grid of degree 2 jump from cell to cell; train φ with "
+            "encoding.degree=3, on a domain with boundary",
+            stacklevel=3,
+        )
 
 
 def _axes(uv: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,6 +40,45 @@ class Composition(nn.Module):
         return value, outer_jacobian @ inner_jacobian
 
 
+class Placed(nn.Module):
+    """x ↦ inner(x) / scale + center: a surface in the units and place of its mesh file.
+
+    The network's values are scaled and moved in double precision where the device has it.
+
+    Args:
+        inner: (N, 2) to (N, n), with ``value_and_jacobian``.
+        scale, center: of the surface, whose values are (points - center (n,)) * scale.
+    """
+
+    scale: Tensor
+    center: Tensor
+
+    def __init__(self, inner: nn.Module, scale: float, center: Tensor) -> None:
+        super().__init__()
+        self.inner = inner
+        like = next(inner.parameters(), torch.zeros(0))
+        kind = torch.float32 if like.device.type == "mps" else torch.float64
+        self.register_buffer("scale", torch.tensor(scale, dtype=kind, device=like.device))
+        self.register_buffer("center", center.detach().to(like.device, kind))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, 2) to (N, n), in the type and on the device of x."""
+        return self._placed(self.inner(self._fit(x))).to(x)
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) to the values (N, n) and Jacobians J_inner(x) / scale, (N, n, 2)."""
+        value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self._fit(x))
+        return self._placed(value).to(x), (jacobian / self.scale).to(x)
+
+    def _placed(self, value: Tensor) -> Tensor:
+        return value / self.scale + self.center.to(value.device)  # closed forms follow x
+
+    def _fit(self, x: Tensor) -> Tensor:
+        """x in the type and on the device of the network's weights."""
+        weight = next(self.inner.parameters(), None)
+        return x if weight is None else x.to(weight)
+
+
 class Rotated(nn.Module):
     """x ↦ inner(R x): a fixed rotation of the input, found from the landmarks beforehand.
 

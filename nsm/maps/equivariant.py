@@ -38,8 +38,10 @@ class EquivariantMap(IdentityInitializedMap):
 class TorusMap(IdentityInitializedMap):
     """h(x) = x + n(x), n periodic: a map of the flat torus to itself, in the identity's class.
 
+    If n is odd, it is a map of the orbifold 2222 as well, which keeps its cones.
+
     Args:
-        network: n, as for :class:`EquivariantMap`.
+        network: n, as for :class:`EquivariantMap`, or a :class:`nsm.maps.MultilevelSpline`.
     """
 
     def forward(self, x: Tensor) -> Tensor:

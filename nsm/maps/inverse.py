@@ -117,14 +117,24 @@ class TransitionMap(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 2)."""
-        return self.second(_Inverse.apply(x, self))
+        return self.second(self._preimage(x))
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, 2) and Jacobians J_j·J_i⁻¹ (N, 2, 2)."""
-        y = _Inverse.apply(x, self)
+        y = self._preimage(x)
         inner = cast(PointMap, self.first).value_and_jacobian(y)[1]
         value, outer = cast(PointMap, self.second).value_and_jacobian(y)
         return value, torch.linalg.solve(inner, outer, left=False)
+
+    def _preimage(self, x: Tensor) -> Tensor:
+        """h_i⁻¹(x) (N, 2), with derivatives by the inverse function theorem."""
+        y: Tensor = _Inverse.apply(x, self)
+        if torch.is_grad_enabled() and any(p.requires_grad for p in self.first.parameters()):
+            # where the weights of h_i move, h_i(y) = x stays true for dy = -J_i⁻¹ dh_i
+            value, jacobian = cast(PointMap, self.first).value_and_jacobian(y.detach())
+            change = (value - value.detach())[..., None]
+            y = y - torch.linalg.solve(jacobian.detach(), change)[..., 0]
+        return y
 
     @torch.no_grad()
     def back(self, x: Tensor) -> Tensor:

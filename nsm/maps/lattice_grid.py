@@ -79,14 +79,21 @@ class LatticeSplineGrid(SplineGrid):
     def rows_of(self, i: Tensor, j: Tensor, cells: Tensor) -> Tensor:
         """Rows (...) of a table for coefficients (i, j), any integers (...), of a grid of cells
         (..., 2)."""
+        return self._rows(
+            torch.remainder(i, cells[..., 0]), torch.remainder(j, cells[..., 1]), cells
+        )
+
+    def _rows(self, i: Tensor, j: Tensor, cells: Tensor) -> Tensor:
+        """As :meth:`rows_of`, of coefficients in one period."""
         n, m = cells[..., 0], cells[..., 1]
-        i, j = torch.remainder(i, n), torch.remainder(j, m)
         if not self.even:
             return i * m + j
         # x → -x takes (i, j) to (N₁ - 1 - i, N₂ - 1 - j): the upper half stands for both
-        low = j < m // 2
-        i, j = torch.where(low, n - 1 - i, i), torch.where(low, m - 1 - j, j)
-        return i * (m // 2) + j - m // 2
+        half = m // 2
+        low, above = j < half, i * half
+        return torch.where(low, (n - 1) * half - above, above) + torch.where(
+            low, half - 1 - j, j - half
+        )
 
     def cell_rows(self, level: int) -> Tensor:
         """Rows (rows, 9) that the points of each cell of Ω see; the cell of row r is number r."""
@@ -107,10 +114,12 @@ class LatticeSplineGrid(SplineGrid):
         z = (y + 1) * (0.5 * size)
         cell = z.detach().floor().clamp(min=0).minimum(size - 1)
         weights, slopes, bends = _bspline(z - cell, _DEGREE)
-        taps = _TAPS.to(x.device)
-        i = cell[:, 0, None, None].long() + taps[:, None, None]
-        j = cell[:, 1, None, None].long() + taps[None, :, None]
-        rows = self.rows_of(i, j, cells[:, None, None, None])
+        corner, side = cell.long(), cells[:, :, None]
+        # the cell itself and those beside it, around the period; cheaper than remainders
+        before = torch.where(corner == 0, side, corner) - 1
+        after = torch.where(corner == side - 1, 0, corner + 1)
+        taps = torch.stack([before, corner, after], dim=2)
+        rows = self._rows(taps[:, 0, :, None], taps[:, 1, None], cells[:, None, None, None])
         rate = 0.5 * size * sign
         scaled = [[w * rate for w in slopes], [w * rate * rate for w in bends]]
         return rows.flatten(1, 2), [weights, *scaled]

@@ -19,6 +19,7 @@ from nsm.maps.encodings import (
     value_and_jacobian_stack,
 )
 from nsm.maps.mlp_with_tangents import MLPWithTangents
+from nsm.maps.multilevel_spline import MultilevelSpline
 from nsm.maps.spline_field import SplineField
 
 
@@ -198,6 +199,23 @@ class NeuralMap(nn.Module):
         return s[0], s[1:].permute(1, 2, 0)
 
 
+class PlanarNetwork(NeuralMap):
+    """For maps h of Ω: on a domain with boundary a :class:`NeuralMap` of the same settings; on a
+    closed domain a :class:`nsm.maps.MultilevelSpline`, which is as good there in half the time.
+
+    The spline has as many cells as the finest of ``encoding.resolutions``; the settings here, and
+    the activation, are of the network alone. ``map=mlp`` takes the network on all domains.
+
+    Args:
+        out_dim: 2 for a planar map h.
+        width, depth: features of the hidden layers; number of blocks; with a boundary.
+        block: as for :class:`NeuralMap`; with a boundary.
+        activation, encoding: modules, as for :class:`NeuralMap`.
+        initialization: ``xavier`` (normal, the paper's), ``kaiming`` (uniform) or ``siren``.
+        linear_skip: ``none`` or ``linear``: a linear function of the encoding's features is added.
+    """
+
+
 def add_linear_skip(stack: Tensor, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """A linear function of features, with its tangents, added to a stack.
 
@@ -263,7 +281,9 @@ def build_network(
     network: nn.Module = made_with(settings, out_dim=out_dim, **parts)
     if not hasattr(network, "value_and_jacobian"):
         network = ForeignMap(network)
-    if not isinstance(network, (NeuralMap, SplineField)):  # these describe themselves
+    if not isinstance(
+        network, (NeuralMap, MultilevelSpline, SplineField)
+    ):  # these describe themselves
         configs = {key: part.config for key, part in parts.items()}
         network.config = {**settings, "out_dim": out_dim, **configs}  # type: ignore[assignment]
     return network

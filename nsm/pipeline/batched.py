@@ -36,6 +36,7 @@ from nsm.pipeline.training import Run, plain, trained
 from nsm.plugins import import_here
 from nsm.results.callbacks import Pictures
 from nsm.results.loggers import WandB
+from nsm.results.meshes import ColouredMesh
 from nsm.sweeps import is_complete
 from nsm.tasks import Overfit, OverfitEnsemble
 from nsm.tasks.ensemble import EnsembleSplit
@@ -126,6 +127,9 @@ def overfit_ensemble(
     def picture(module: Any) -> np.ndarray:
         return task_of[module].picture(module)
 
+    def mesh(module: Any) -> ColouredMesh | None:
+        return task_of[module].mesh(module)
+
     config = members[0].run.config
     settings = plain(config)["data"]
     settings.pop("_target_")
@@ -140,7 +144,14 @@ def overfit_ensemble(
         data,
         OverfitEnsemble(modules),
         console,
-        Pictures(OverfitTask.picture_name, picture, config.trainer.log_pictures),
+        Pictures(
+            OverfitTask.picture_name,
+            picture,
+            config.trainer.log_pictures,
+            mesh,
+            config.trainer.log_meshes,
+            config.trainer.log_histograms,
+        ),
         f"overfit {len(members)} networks",
     )
     return modules, trainer

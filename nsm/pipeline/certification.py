@@ -36,7 +36,7 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
         alone (``before_repair``), and the number of further trainings (``rounds``).
     """
     settings, say = task.config.certification, task.console.print
-    best = result = task.make_result(module)
+    task.trained = best = result = task.make_result(module)
     before = result.certificate
     rounds = 0
     while settings.repair and not best.certificate["certified"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,14 @@ import torch
 from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
-from nsm.domains.joint_preparation import Matched, matched_landmarks
-from nsm.domains.orbifold.alignment import alignments_to_first
-from nsm.errors import NsmError
+from nsm.domains.joint_preparation import Matched, Mesh, matched_landmarks, with_ends
+from nsm.domains.orbifold.collection_alignment import alignments_to_first, disagreements
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
+from nsm.pipeline.collection_inputs import collected
+from nsm.pipeline.landmark_inputs import name_of
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -27,6 +30,7 @@ from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     SurfaceCollection,
+    SurfaceMap,
     collection_metrics,
     collection_table,
     export_surface,
@@ -34,10 +38,21 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_tears,
+    write_correspondences,
 )
+from nsm.results.collection_pictures import cycle_picture
+from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, export_ply, painted
 from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import start_figures
+from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
-from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import (
+    aligned,
+    carried,
+    landmark_rotation,
+    least_distorting_rotation,
+)
 
 _SEAM_POINTS = 24  # on each branch
 _RINGS = 80  # of an even mesh of the common domain
@@ -56,40 +71,67 @@ class CollectionMapTask(Task):
     closed_domains = True
     table = staticmethod(collection_table)
     picture_name = "map"
+    has_template = False  # the first surface is one
+    template_mesh: Mesh | None = None  # of its file
+    proposed: ProposedLandmarks | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
-        return list(surfaces) if isinstance(surfaces, (list, tuple)) else []
+        return collected(surfaces, self._template(given))
+
+    def _template(self, given: Given) -> Any:
+        # absent in older run folders
+        return self.settings.get("template") if given.template is None else given.template
 
     def prepare(self, given: Given) -> None:
-        self.keep_absolute("surfaces", "landmarks")
-        surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
-        if not isinstance(surfaces, Sequence) or isinstance(surfaces, str) or len(surfaces) < 3:
-            raise NsmError(
-                "setting surfaces: a collection needs a list of three surfaces or more",
-                kind="out_of_range",
-                key="surfaces",
-            )
+        surfaces, template = self.inputs(given), self._template(given)
+        if given.surfaces is None:  # those that match a pattern now
+            self.config.surfaces = surfaces if template is None else surfaces[1:]
+        self.keep_absolute("surfaces", "template", "landmarks")
         shapes = [
             read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
             for k, surface in enumerate(surfaces)
         ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        if landmarks is None:
+            landmarks = files_beside(surfaces, [name_of(shape) for shape in shapes])
+            if landmarks is not None:
+                files = ", ".join(Path(file).name for file in landmarks)
+                self.console.print(f"landmarks beside the meshes: {files}", soft_wrap=True)
+        self.has_template = template is not None
+        self.template_mesh = shapes[0] if isinstance(shapes[0], Mesh) else None
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks,
+            shapes,
+            self.domain,
+            self.config,
+            self.console,
+            template=self.has_template,
+        )
         self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
         """Take the surfaces, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(surfaces=phis))
         refuse_other_topology(phis)
+        ids = with_ends([phi.surface for phi in phis], ids)
         self.phis, self.ids, self.surface = list(phis), ids, phis[0].surface
         self.matched = matched_landmarks([phi.surface for phi in phis], ids)
         targets = torch.as_tensor(np.stack(self.matched.points), dtype=torch.float32)
-        self.targets, self.starts = targets, self._starts(targets)
-        back = torch.stack([h.back(q) for h, q in zip(self.starts, targets, strict=True)])
+        self.starts = self._starts(targets)
+        there = torch.isfinite(targets).all(dim=-1)[..., None]
+        some = torch.where(there, targets, 0.0)
+        back = torch.stack([h.back(q) for h, q in zip(self.starts, some, strict=True)])
         if not self.domain.has_boundary:
-            back = torch.stack([self.domain.lift(x, targets[0]) for x in back])
-        self.points = back.mean(dim=0)
+            owner = there[..., 0].int().argmax(dim=0)
+            first = back[owner, torch.arange(len(owner))]
+            back = torch.stack([self.domain.lift(x, first, self.surface.lattice) for x in back])
+        self.points = (back * there).sum(dim=0) / there.sum(dim=0)
+        near = zip(self.phis, self.starts, some, strict=True)
+        lifted = torch.stack(
+            [self.domain.lift(q, h.before(self.points), phi.surface.lattice) for phi, h, q in near]
+        )
+        self.targets = torch.where(there, lifted, torch.nan)
         on_boundary = slice(self.matched.on_boundary)
         if self.domain.has_boundary:
             self.points[on_boundary] = self.domain.to_boundary(self.points[on_boundary])
@@ -99,14 +141,24 @@ class CollectionMapTask(Task):
         surfaces = [phi.surface for phi in self.phis]
         if not self.domain.has_boundary:
             common = self.ids if targets.shape[1] else None
-            return [aligned(found.inverse) for found in alignments_to_first(surfaces, common)]
+            to_first = alignments_to_first(surfaces, common)
+            for pair in disagreements(surfaces, to_first, common):
+                ends = f"{surfaces[pair.source].name} → {surfaces[pair.target].name}"
+                self.console.print(
+                    f"{ends}: the isotopy class that follows from the other pairs scores "
+                    f"{pair.composed.score:.3f}, the pair's own best {pair.own.score:.3f}; if the "
+                    "map is distorted, map the pair alone or check its landmarks",
+                    soft_wrap=True,
+                )
+            return [aligned(found.inverse) for found in to_first]
         uv = torch.as_tensor(self.surface.uv, dtype=torch.float32)
         some = uv[:: len(uv) // 4096 + 1]
         first, *others = self.phis
         rotations = [torch.eye(2)]
         for k, phi in enumerate(others, start=1):
-            if targets.shape[1]:
-                rotations.append(landmark_rotation(self.domain, targets[0], targets[k]))
+            both = torch.isfinite(targets[[0, k]]).all(dim=-1).all(dim=0)
+            if both.any():
+                rotations.append(landmark_rotation(self.domain, targets[0, both], targets[k, both]))
             else:
                 rotation = least_distorting_rotation(self.domain, first.map, phi.map, some)
                 rotations.append(rotation)
@@ -117,15 +169,24 @@ class CollectionMapTask(Task):
         return f"{self.name} of {len(self.phis)} surfaces"
 
     def build(self) -> Any:
+        points, targets = self.points, self.targets
+        if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
+            # as for pairs: the corners are key points (METHOD)
+            corners = torch.from_numpy(self.domain.corners).to(points)
+            points = torch.cat([points, corners])
+            kept = torch.stack([start.before(corners) for start in self.starts])
+            targets = torch.cat([targets, kept], dim=1)
+        names = [phi.surface.name for phi in self.phis]
         return self.module(
             **self.map_settings(),
-            points=self.points,
-            targets=self.targets,
+            points=points,
+            targets=targets,
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
             starts=self.starts,
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[self.tabulated(phi) for phi in self.phis],
+            names=names if len(set(names)) == len(names) else None,
         )
 
     def _mesh(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -172,35 +233,74 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+        for (i, j), name in result.pair_names.items():
+            figures = result.metrics["pairs"][name]
+            source, target = self.phis[i].surface, self.phis[j].surface
+            if self.trained is not None:
+                before = flipped_percent(self.trained.pair(i, j).image_uv, source.faces)
+                figures["flipped_before_repair_percent"] = before
+            ends = self.starts[j], self.starts[i]
+            both = self.matched.shared(i, j)
+            begin, end = (self.matched.points[k][both] for k in (i, j))
+            first, places = (carried(x, *ends) for x in (source.uv, begin))
+            figures |= start_figures(source, target, first, places, end)
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
         every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
         return [torn for torn in every if torn is not None]
 
     def figures(self, result: SurfaceCollection) -> dict[str, Any]:
-        names = [phi.surface.name for phi in self.phis]
-        return {"surfaces": names, "landmarks": len(self.ids[0])}
+        said = {"surfaces": result.names, "landmarks": len(self.ids[0])}
+        return {**said, "template": result.names[0]} if self.has_template else said
 
     def picture(self, module: Any) -> np.ndarray:
-        # where the vertices of the first go if h_0 is taken for its start
+        return map_image(self.surface, self.phis[-1].surface, self._in_the_last(module))
+
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.phis[-1].surface.at(self._in_the_last(module))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
+    def _in_the_last(self, module: Any) -> np.ndarray:
+        """Where the vertices of the first surface go in the last one's domain (V, 2), if h_0 is
+        taken for its start."""
         start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
-        uv = evaluate(module.map[-1], start.numpy())
-        return map_image(self.surface, self.phis[-1].surface, uv)
+        return evaluate(module.map[-1], start.numpy())
+
+    def save(self, folder: Path, result: SurfaceCollection) -> None:
+        super().save(folder, result)
+        if self.proposed is not None:
+            (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
         figures_picture(folder / "figures.png", result)
         transfer_matrix_picture(folder / "transfer.png", result)
-        for i, source in enumerate(result.surfaces):
-            for j, target in enumerate(result.surfaces):
-                if i != j:
-                    self._write_pair(folder / f"{i}_to_{j}", result.pair(i, j), source, target)
+        cycle_picture(folder / "cycle.png", result)
+        names = [re.sub(r"[/\\]", "_", name) for name in result.names]
+        for i, j in itertools.permutations(range(len(result)), 2):
+            if self.has_template and 0 not in (i, j):
+                continue
+            f = result.pair(i, j)
+            self._write_pair(folder / f"{names[i]}_to_{names[j]}", f)
+            if self.has_template and i == 0:
+                export_ply(folder / f"{names[j]}_in_{names[0]}.ply", *self._on_template(f))
 
-    def _write_pair(
-        self, folder: Path, f: Any, source: NeuralSurface, target: NeuralSurface
-    ) -> None:
+    def _on_template(self, f: SurfaceMap) -> tuple[np.ndarray, np.ndarray]:
+        """The template's vertices (V, 3) on a scan, and the faces (F, 3) of its file, both in its
+        order; faces of removed parts are left out."""
+        points = f.target.in_original_units(f.welded_image)
+        if self.template_mesh is None:
+            return points, f.weld.faces
+        # landmarks inside triangles are further vertices of the map, not of the file
+        count, faces = len(self.template_mesh.vertices), self.template_mesh.faces
+        there = f.source.surface.cut_vertex >= 0
+        return points[:count], np.asarray(faces[there[faces].all(axis=1)])
+
+    def _write_pair(self, folder: Path, f: SurfaceMap) -> None:
+        target = f.target
         folder.mkdir(exist_ok=True)
         image = target.in_original_units(f.welded_image)
         np.save(folder / "mapped_vertices.npy", image)
+        write_correspondences(folder / "correspondences.npz", f)
         vertices = target.in_original_units(target.surface.vertices)
         file = folder / "target_with_source_uv.glb"
         export_surface(file, vertices, target.surface, f.source_uv)

@@ -28,7 +28,8 @@ def named_mesh(config: DictConfig) -> str:
 
 def configured_repairs(config: DictConfig) -> Repairs:
     """The decisions of the group ``surface`` on meshes; older run folders have none."""
-    return Repairs(config.surface.get("parts"), config.surface.get("repair"))
+    chosen = config.surface
+    return Repairs(chosen.get("parts"), chosen.get("repair"), chosen.get("fill_holes", False))
 
 
 def configured_surface(config: DictConfig, console: Console, given: Any = None) -> Surface:

@@ -18,15 +18,15 @@ from nsm.pipeline.configured_surface import (
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
-    checkerboard,
     checkerboard_picture,
     error_picture,
-    export_mesh,
+    export_surface,
     metrics_table,
     overfit_metrics,
     reconstruction_image,
 )
-from nsm.results.textures import checkerboard_at
+from nsm.results.meshes import ColouredMesh, painted
+from nsm.results.metrics import evaluate
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 
@@ -80,14 +80,14 @@ class OverfitTask(Task):
     def picture(self, module: Any) -> np.ndarray:
         return reconstruction_image(self.surface, module, size=384)
 
+    def mesh(self, module: Any) -> ColouredMesh:
+        surface = self.surface
+        return painted(evaluate(module, surface.uv), surface.faces, surface.vertices)
+
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
-        vertices, faces, uv = result.to_mesh()
-        obj, glb = folder / "reconstruction.obj", folder / "reconstruction.glb"
-        if result.surface.domain.has_boundary:
-            export_mesh(obj, vertices, faces, uv)
-            export_mesh(glb, vertices, faces, uv, texture=checkerboard())
-        else:
-            export_mesh(obj, vertices, faces, None)
-            export_mesh(glb, vertices, faces, None, colours=checkerboard_at(uv))
+        vertices = result(result.surface.uv)
+        for ending in (".obj", ".glb"):
+            file = folder / f"reconstruction{ending}"
+            export_surface(file, vertices, result.surface, result.surface.uv)
         error_picture(folder / "error.png", result.surface, result)
         checkerboard_picture(folder / "checkerboard.png", result.surface, result)

@@ -8,24 +8,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.text import Text
-from scipy.sparse import save_npz
 
 from nsm.data import SurfaceData
-from nsm.domains.joint_preparation import matched_landmarks
+from nsm.domains.joint_preparation import matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
-from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.proposed_landmarks import (
-    AUTO,
-    ProposedLandmarks,
-    asks_for_proposal,
-    propose_landmarks,
-)
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
-    landmark_vertices,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -45,12 +38,25 @@ from nsm.results import (
     morph_pictures,
     pair_metrics,
     pair_table,
+    reliability_picture,
     transfer_picture,
     warning_of_tears,
+    write_correspondences,
+    write_reliability,
 )
+from nsm.results.file_faces import faces_of_file
+from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
+from nsm.results.pair_metrics import start_figures
+from nsm.results.pair_pictures import normals_picture
 from nsm.tasks import PairMap
-from nsm.tasks.initial_rotation import aligned, landmark_rotation, least_distorting_rotation
+from nsm.tasks.initial_rotation import (
+    aligned,
+    carried,
+    landmark_rotation,
+    least_distorting_rotation,
+)
 
 _MORPH_FRAMES = 9
 _CLASSES_SHOWN, _CLASSES_TRIED = 4, 3
@@ -84,18 +90,11 @@ class PairMapTask(Task):
         ]
         self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
-        self.proposed = None
-        if asks_for_proposal(landmarks, shapes, self.domain):
-            self.proposed = propose_landmarks(
-                shapes,
-                **settings["proposal"],
-                asked=landmarks == AUTO,
-                console=self.console,
-                repairs=configured_repairs(self.config),
-            )
-            landmarks = self.proposed.landmarks if self.proposed else None
-        ids = landmark_vertices(landmarks, shapes, self.console)
+        of_files = self.textures is not None or any(settings["attributes"].values())
         counts = [vertex_count(shape) for shape in shapes]
+        shapes, ids, self.proposed = given_or_proposed(
+            landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
+        )
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
@@ -104,6 +103,7 @@ class PairMapTask(Task):
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""
         self.choose_domain(Given(source=phi, target=psi))
         refuse_other_topology([phi, psi])
+        ids = with_ends([phi.surface, psi.surface], ids)
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
@@ -124,7 +124,8 @@ class PairMapTask(Task):
             torch.as_tensor(array, dtype=torch.float32)
             for array in (*self.matched.points, source.uv, source.uv[seam_pairs])
         )
-        start = self._start(p, q)
+        self.start = start = self._start(p, q)
+        q = self.domain.lift(q, start.before(p), target.lattice)
         phi, psi = self._for_training()
         if self.domain.has_boundary and self.config.constraints.boundary == "penalty":
             # the exact boundary keeps corners by construction; here they are key points (METHOD)
@@ -210,6 +211,11 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        if self.trained is not None:
+            before = flipped_percent(self.trained.image_uv, source.faces)
+            result.metrics["flipped_before_repair_percent"] = before
+        first, places = (carried(x, self.start) for x in (source.uv, points))
+        result.metrics.update(start_figures(source, target, first, places, targets))
         if len(source.seam_pairs) and source.domain.has_boundary:
             result.metrics.update(result.weld.figures(target.bounding_box_diagonal))
 
@@ -231,6 +237,10 @@ class PairMapTask(Task):
     def picture(self, module: Any) -> np.ndarray:
         return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
 
+    def mesh(self, module: Any) -> ColouredMesh:
+        image = self.psi.surface.at(evaluate(module, self.surface.uv))
+        return painted(image, self.surface.faces, self.surface.vertices)
+
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
         if self.proposed is not None:
@@ -250,14 +260,30 @@ class PairMapTask(Task):
         for name, mesh in meshes.items():
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
-        save_npz(folder / "source_to_target.npz", f.matrix())
-        (folder / "morph").mkdir(exist_ok=True)
-        for k in range(_MORPH_FRAMES):
-            frame = f.source.in_original_units(f.morph(k / (_MORPH_FRAMES - 1)))
-            export_surface(folder / "morph" / f"{k:02d}.obj", frame, s, s.uv)
+        write_correspondences(folder / "correspondences.npz", f)
+        write_reliability(folder / "reliability.ply", f)
+        reliability_picture(folder / "reliability.png", f)
+        _write_morph(folder, f, self.console)
         transfer_picture(folder / "transfer.png", f)
         distortion_picture(folder / "distortion.png", f)
+        if isinstance(f.target.map, AnalyticSurface):
+            normals_picture(folder / "normals.png", f)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+
+def _write_morph(folder: Path, f: SurfaceMap, console: Console) -> None:
+    """The path from the source to its image, with the vertices and faces of the source's file."""
+    s = f.source.surface
+    faces, corners = faces_of_file(s)
+    uv = s.uv if s.domain.has_boundary else None
+    (folder / "morph").mkdir(exist_ok=True)
+    for k in range(_MORPH_FRAMES):
+        frame = f.morph(k / (_MORPH_FRAMES - 1))
+        export_mesh(folder / "morph" / f"{k:02d}.obj", frame, faces, uv, corners=corners)
+    try:
+        f.export_morph(folder / "morph.glb")
+    except NsmError as error:  # of sizes that GLB has no numbers for
+        console.print(f"  left out: {error}")
 
 
 def _write_image(folder: Path, f: SurfaceMap) -> None:
@@ -266,8 +292,5 @@ def _write_image(folder: Path, f: SurfaceMap) -> None:
     image = f.target.in_original_units(f.welded_image)
     np.save(folder / "mapped_vertices.npy", image)
     points = f.target.in_original_units(weld.points)
-    export_surface(folder / "mapped.glb", points, s, s.uv)
-    if s.domain.has_boundary:
-        export_mesh(folder / "mapped.obj", image, weld.faces, s.uv, corners=weld.corners)
-    else:
-        export_surface(folder / "mapped.obj", points, s, s.uv)
+    for ending in (".obj", ".glb"):
+        export_surface(folder / f"mapped{ending}", points, s, s.uv)

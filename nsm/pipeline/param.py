@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +13,22 @@ import torch
 from nsm.data import SurfaceData
 from nsm.domains.baselines import BASELINES
 from nsm.maps import Remembered
+from nsm.pipeline.charts import neural_charts
 from nsm.pipeline.surface_cache import neural_surface
 from nsm.pipeline.task import Given, Task, frozen
 from nsm.results import (
     NeuralSurface,
     Parameterization,
-    checkerboard,
     comparison_table,
-    export_mesh,
+    export_surface,
     layout_image,
     parameterization_picture,
     planar_metrics,
 )
+from nsm.results.map_metrics import flipped_percent
+from nsm.results.meshes import ColouredMesh, painted
+from nsm.results.metrics import evaluate
+from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
@@ -35,16 +41,43 @@ class ParamTask(Task):
     certified = True
     table = staticmethod(comparison_table)
     picture_name = "layout"
+    charts: Sequence[NeuralSurface] = ()  # into which given seams cut the mesh
 
     def inputs(self, given: Given) -> list[Any]:
         ready = self.config.phi.path if given.phi is None else given.phi
         return [] if ready is None else [ready]
 
     def prepare(self, given: Given) -> None:
-        phi = given.phi
-        if not isinstance(phi, NeuralSurface):
+        phi, seams = given.phi, self.settings.get("seams")  # absent in older run folders
+        if seams is not None:
+            self.keep_absolute("seams")
+            self.charts = neural_charts(self.config, self.console, phi, seams)
+            phi = self.charts[0]
+        elif not isinstance(phi, NeuralSurface):
             phi = neural_surface(self.config, self.console, phi)
         self.use(phi)
+
+    def parts(self) -> list[Task]:
+        return [self._part(phi) for phi in self.charts] if len(self.charts) > 1 else []
+
+    def _part(self, phi: NeuralSurface) -> Task:
+        part, config = ParamTask(self.name), copy.deepcopy(self.config)
+        config.artefacts = False  # those of the atlas are written
+        part.setup(config, self.console)
+        part.use(phi)
+        return part
+
+    def joined(self, results: list[Any]) -> ParameterizationAtlas:
+        return ParameterizationAtlas(results)
+
+    def figures(self, result: Parameterization | ParameterizationAtlas) -> dict[str, Any]:
+        if isinstance(result, Parameterization):
+            return {}
+        return {"surface": self.surface.name.rpartition("-")[0], "charts": len(result.charts)}
+
+    def inner_line(self, result: Parameterization) -> str:
+        median = result.metrics["nsm"]["symmetric_dirichlet_median"]
+        return f"flattened, median symmetric Dirichlet {median:.3f}"
 
     def use(self, phi: NeuralSurface) -> None:
         """Take the neural surface."""
@@ -69,7 +102,9 @@ class ParamTask(Task):
     def make_result(self, module: Any) -> Parameterization:
         return Parameterization(self.phi, frozen(module.map), {}, self.settings)
 
-    def measure(self, result: Parameterization) -> None:
+    def measure(self, result: Parameterization | ParameterizationAtlas) -> None:
+        if isinstance(result, ParameterizationAtlas):
+            return  # its charts are measured
         surface = self.surface
         maps = {"domain": surface.uv, "nsm": result.uv}
         for name, method in BASELINES.items():
@@ -80,20 +115,35 @@ class ParamTask(Task):
         for name, uv in maps.items():
             result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
         result.metrics["nsm"].update(result.certificate)
+        if self.trained is not None:
+            result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(
+                self.trained.uv, surface.faces, mirrored=True
+            )
 
     def picture(self, module: Any) -> np.ndarray:
-        uv = module(torch.as_tensor(self.surface.uv, dtype=torch.float32, device=module.device))
-        image = layout_image(self.surface, uv.detach().cpu().double().numpy())
+        image = layout_image(self.surface, evaluate(module, self.surface.uv))
         return np.round(255 * image).astype(np.uint8)
 
-    def write_artefacts(self, folder: Path, result: Parameterization) -> None:
+    def mesh(self, module: Any) -> ColouredMesh:
+        uv = evaluate(module, self.surface.uv)
+        flat = np.column_stack([uv, np.zeros(len(uv))])
+        return painted(flat, self.surface.faces, self.surface.vertices)
+
+    def write_artefacts(
+        self, folder: Path, result: Parameterization | ParameterizationAtlas
+    ) -> None:
+        if isinstance(result, ParameterizationAtlas):
+            result.export(folder)
+            return
         surface = self.surface
         inside = _into_square(result.uv)
-        for ending, texture in (("obj", None), ("glb", checkerboard())):
-            file = folder / f"parameterized.{ending}"
-            export_mesh(file, surface.vertices, surface.faces, inside, texture=texture)
-        write_patterns(folder / "pattern", result.uv / surface.scale, surface.faces)
-        before_after = {"before: domain Ω": surface.uv, "after": result.uv}
+        vertices = self.phi.in_original_units(surface.vertices)
+        for ending in (".obj", ".glb"):
+            export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
+        faces = surface.faces[~surface.filled]
+        write_patterns(folder / "pattern", result.uv / surface.scale, faces)
+        energy = str(self.config.energy["_target_"]).rpartition(".")[2]
+        before_after = {"before: domain Ω": surface.uv, f"after: {energy}": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
 

@@ -1,144 +1,228 @@
-"""landmarks=auto: landmarks that nobody gave, and what is said and kept of them."""
+"""Landmarks that nobody gave, or that complete those given, and what is said and kept of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.text import Text
 
-from nsm.correspondence import Proposal, proposed
+from nsm.correspondence import proposed, proposed_for_all
 from nsm.domains import DOMAINS, Domain
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
+from nsm.pipeline.configured_surface import configured_repairs
+from nsm.pipeline.landmark_inputs import landmark_vertices
+from nsm.pipeline.landmark_places import as_places, with_places
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.landmark_files import to_json
-from nsm.surfaces.validation import NO_DECISION, Repairs, clean
+from nsm.surfaces.validation import CleanMesh, clean
 
 AUTO = "auto"
+_COMPLETED = 4  # landmarks at most that are completed by others
 
 
 @dataclass(frozen=True)
 class ProposedLandmarks:
-    """A proposal in the numbers of the mesh files.
+    """Proposals in the numbers of the mesh files.
 
     Attributes:
-        proposal: hypotheses, best first.
-        pairs: of each hypothesis vertices (L, 2) of both files.
+        vertices: of each hypothesis (L, k), best first; the given landmarks before the others.
+        scores: of each; lower is better.
+        margin: how far the first is ahead, in log energy.
+        sure: whether that is enough.
+        given: how many landmarks were given.
         chosen: the number of the hypothesis that is taken.
+        places: of each mesh the faces (F, 3) of its file and the places (G, 4) of given landmarks,
+            if they are places.
     """
 
-    proposal: Proposal
-    pairs: list[np.ndarray]
+    vertices: list[np.ndarray]
+    scores: list[float]
+    margin: float
+    sure: bool
+    given: int
     chosen: int
+    places: Sequence[tuple[np.ndarray, np.ndarray] | None] = ()
 
     @property
-    def landmarks(self) -> dict[str, list[int]]:
-        """The landmarks that are taken, as the setting ``landmarks`` has them."""
-        pairs = self.pairs[self.chosen]
-        return {"source": pairs[:, 0].tolist(), "target": pairs[:, 1].tolist()}
+    def landmarks(self) -> list[np.ndarray]:
+        """The landmarks (L,) that are taken, of each surface."""
+        return list(self.vertices[self.chosen].T)
 
     def to_json(self) -> str:
         """The landmarks as a file that can be corrected and given back, with the alternatives."""
-        hypotheses = self.proposal.hypotheses
         others = [
-            {"source": p[:, 0].tolist(), "target": p[:, 1].tolist(), "score": round(h.score, 4)}
-            for k, (p, h) in enumerate(zip(self.pairs, hypotheses, strict=True))
+            {**_named(self._written(rows)), "score": round(score, 4)}
+            for k, (rows, score) in enumerate(zip(self.vertices, self.scores, strict=True))
             if k != self.chosen
         ]
-        pairs = self.pairs[self.chosen]
         return to_json(
-            [pairs[:, 0], pairs[:, 1]],
+            self._written(self.vertices[self.chosen]),
             None,
-            score=round(hypotheses[self.chosen].score, 4),
-            sure=self.proposal.sure,
+            given=self.given,
+            score=round(self.scores[self.chosen], 4),
+            sure=self.sure,
             alternatives=others,
         )
 
+    def _written(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Landmarks (L, k) as the mesh files have them: without the vertices made for places."""
+        places = self.places or [None] * rows.shape[1]
+        return [
+            one if known is None else as_places(one, *known)
+            for one, known in zip(rows.T, places, strict=True)
+        ]
 
-def asks_for_proposal(landmarks: Any, shapes: Sequence[Shape], domain: Domain) -> bool:
-    """Whether landmarks are to be proposed: they are ``auto``, or none are given for closed meshes
-    of genus 0, on the orbifold."""
-    if isinstance(landmarks, str):
-        return landmarks == AUTO
-    meshes = all(isinstance(shape, Mesh) for shape in shapes)
-    return landmarks is None and meshes and domain == DOMAINS["orbifold"]
+    @property
+    def said(self) -> str:
+        """What was given, what is proposed, and how sure that is."""
+        count = len(self.vertices[self.chosen]) - self.given
+        kept = f"{self.given} given are kept, " if self.given else ""
+        ahead = (
+            f"{self.margin:.3f} ahead of the next different map, in log energy"
+            if np.isfinite(self.margin)
+            else "no different map among the best"
+        )
+        sure = "sure" if self.sure else "NOT SURE"
+        return f"landmarks: {kept}{count} proposed, {sure}: {ahead}"
 
 
-def propose_landmarks(
+def given_or_proposed(
+    landmarks: Any,
     shapes: Sequence[Shape],
-    strict: bool,
-    alternative: int,
-    asked: bool,
+    domain: Domain,
+    config: DictConfig,
     console: Console,
-    repairs: Repairs = NO_DECISION,
-) -> ProposedLandmarks | None:
-    """Propose landmarks of two meshes, and say how sure they are.
+    exact: bool = True,
+    template: bool = False,
+) -> tuple[list[Shape], list[np.ndarray], ProposedLandmarks | None]:
+    """The landmarks of a map: those given, those proposed, or both.
+
+    Landmarks are proposed if they are ``auto``; and on the orbifold for meshes if none are given,
+    or one to four, which are completed. Four are enough for common cones: unsure ones do not come
+    to them.
 
     Args:
-        shapes: source and target.
-        strict: whether a proposal that is not sure is an error.
-        alternative: which hypothesis is taken, 0 for the best.
-        asked: whether the user asked for it; else a mesh that has no tips gives None.
+        landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them, or
+            ``auto``.
+        shapes: two or more.
+        domain: of the map.
+        config: of the run: its ``proposal`` and the decisions on meshes.
         console: where to say it.
-        repairs: the user's decisions on the meshes.
+        exact: landmarks that are places in triangles become vertices; else the nearest vertex
+            stands for each.
+        template: as for :func:`nsm.pipeline.landmark_inputs.landmark_vertices`.
+
+    Returns:
+        the shapes, with these vertices; the landmarks as vertices (L,) of each; and the proposal if
+        there is one.
 
     Raises:
-        NsmError: ``wrong_type``: a shape that is no mesh; ``unsure_landmarks``; ``out_of_range``:
-            fewer alternatives; or as :func:`nsm.correspondence.proposed`.
+        NsmError: ``wrong_type``: ``auto`` for a shape that is no mesh; ``unsure_landmarks``, with
+            ``proposal.strict``; ``out_of_range``: fewer alternatives; or as
+            :func:`nsm.correspondence.proposed` and
+            :func:`nsm.pipeline.landmark_inputs.landmark_vertices`.
     """
-    meshes = []
-    for shape in shapes:
-        if not isinstance(shape, Mesh):
-            raise NsmError(
-                "landmarks=auto: source and target must be meshes, not neural surfaces or analytic "
-                "ones; give mesh files or landmarks",
-                kind="wrong_type",
-                key="landmarks",
-            )
-        meshes.append(clean(shape.vertices, shape.faces, shape.name, repairs))
-    source, target = meshes
+    settings = config.proposal
+    asked = isinstance(landmarks, str) and landmarks == AUTO
+    meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
+    if asked and len(meshes) < len(shapes):
+        raise NsmError(
+            "landmarks=auto: all surfaces must be meshes, not neural surfaces or analytic ones; "
+            "give mesh files or landmarks",
+            kind="wrong_type",
+            key="landmarks",
+        )
+    if asked:
+        landmarks = None
+    none = landmarks is None
+    known: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(shapes)
+    if exact and not none:
+        files = shapes
+        shapes, landmarks, places = with_places(landmarks, files, console, template=template)
+        known = [
+            (file.faces, one) if isinstance(file, Mesh) and one is not None else None
+            for file, one in zip(files, places, strict=True)
+        ]
+    meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
+    told = exact and not none
+    ids = landmark_vertices(landmarks, shapes, console, template=template, told=told)
+    some_lack = any((of_one < 0).any() for of_one in ids)
+    few = settings.complete and 1 <= len(ids[0]) <= _COMPLETED and not some_lack
+    possible = len(meshes) == len(shapes) and domain == DOMAINS["orbifold"]
+    if not (asked or (possible and (none or few))):
+        return list(shapes), ids, None
+    repairs = configured_repairs(config)
+    cleaned = [clean(mesh.vertices, mesh.faces, mesh.name, repairs) for mesh in meshes]
+    if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):
+        return list(shapes), ids, None  # refused where the meshes are prepared
     try:
-        proposal = proposed((source.vertices, source.faces), (target.vertices, target.faces))
+        found = _proposal(cleaned, ids, settings.alternative)
     except NsmError as error:
-        if asked or strict:
+        if asked or settings.strict or error.key == "proposal.alternative":
             raise
         console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
-        return None
-    found = proposal.hypotheses
-    if alternative >= len(found):
+        return list(shapes), ids, None
+    if len(ids[0]) == _COMPLETED and not found.sure and not settings.alternative:
+        console.print(f"{found.said}; only those given are taken", soft_wrap=True)
+        return list(shapes), ids, None
+    if settings.strict and not found.sure:
         raise NsmError(
-            f"proposal.alternative={alternative}: there are {len(found)} proposals; give a number "
-            f"from 0 to {len(found) - 1}",
-            kind="out_of_range",
-            key="proposal.alternative",
-        )
-    ends = (source.source_vertex, target.source_vertex)
-    pairs = [np.stack([ids[h.vertices[:, k]] for k, ids in enumerate(ends)], axis=1) for h in found]
-    line = _said(proposal, len(pairs[alternative]))
-    if strict and not proposal.sure:
-        raise NsmError(
-            f"{line}; give landmarks, or leave proposal.strict out",
+            f"{found.said}; give landmarks, or leave proposal.strict out",
             kind="unsure_landmarks",
             key="proposal.strict",
         )
-    if proposal.sure:
-        console.print(line, soft_wrap=True)
+    if found.sure:
+        console.print(found.said, soft_wrap=True)
     else:
         advice = "check landmarks.json of the run, or try proposal.alternative=1"
-        warning = Text(f"WARNING: {line}; {advice}", style="yellow")
-        console.print(warning, soft_wrap=True)
-    return ProposedLandmarks(proposal, pairs, alternative)
+        console.print(Text(f"WARNING: {found.said}; {advice}", style="yellow"), soft_wrap=True)
+    return list(shapes), found.landmarks, replace(found, places=known)
 
 
-def _said(proposal: Proposal, count: int) -> str:
-    first = f"landmarks=auto: {count} pairs proposed"
-    if len(proposal.hypotheses) == 1:
-        ahead = "no different map among the best"
+def _proposal(
+    meshes: Sequence[CleanMesh], ids: Sequence[np.ndarray], alternative: int
+) -> ProposedLandmarks:
+    """Hypotheses for cleaned meshes, as vertices of their files.
+
+    Raises:
+        NsmError: ``out_of_range``, with the key ``proposal.alternative``; or as
+            :func:`nsm.correspondence.proposed`.
+    """
+    arrays = [(mesh.vertices, mesh.faces) for mesh in meshes]
+    given = np.stack([m.merged[k] for m, k in zip(meshes, ids, strict=True)], axis=1)
+    if len(meshes) == 2:
+        pair = proposed(arrays[0], arrays[1], given)
+        rows = [h.vertices for h in pair.hypotheses]
+        scores, margin, sure = [h.score for h in pair.hypotheses], pair.margin, pair.sure
     else:
-        ahead = f"{proposal.margin:.3f} ahead of the next different map, in log energy"
-    sure = "sure" if proposal.sure else "NOT SURE"
-    return f"{first}, {sure}: {ahead}; mean energy {proposal.hypotheses[0].energy:.2f}"
+        every = proposed_for_all(arrays, given)
+        rows, scores, margin, sure = every.vertices, every.scores, every.margin, every.sure
+    if alternative >= len(rows):
+        raise NsmError(
+            f"proposal.alternative={alternative}: there are {len(rows)} proposals; give a number "
+            f"from 0 to {len(rows) - 1}",
+            kind="out_of_range",
+            key="proposal.alternative",
+        )
+    numbers = [
+        np.stack([mesh.source_vertex[row] for mesh, row in zip(meshes, one.T, strict=True)], axis=1)
+        for one in rows
+    ]
+    # not in the middle of filled holes
+    numbers = [one[(one >= 0).all(axis=1)] for one in numbers]
+    for one in numbers:  # a vertex that was merged with another keeps its number
+        one[: len(ids[0])] = np.stack(ids, axis=1)
+    return ProposedLandmarks(numbers, scores, margin, sure, len(ids[0]), alternative)
+
+
+def _named(lists: Sequence[np.ndarray]) -> dict[str, Any]:
+    plain = [one.tolist() for one in lists]
+    if len(plain) == 2:
+        return {"source": plain[0], "target": plain[1]}
+    return {"landmarks": plain}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nsm.errors import NsmError
@@ -17,7 +18,7 @@ from nsm.pipeline.checkpoints import CHECKPOINT_FILE
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.process_state import process_state
 from nsm.pipeline.task import Given, Task
-from nsm.pipeline.training import Run, check_device, stored_config, trained
+from nsm.pipeline.training import CONFIG_FILE, Run, check_device, stored_config, trained
 from nsm.results import atomic_write
 from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
@@ -79,7 +80,9 @@ def run_task(
         check_packages(config.logger)
         task.choose_domain(given or Given())
         task.prepare(given or Given())
-        return run_prepared(task, Run(config, folder, resuming), started)
+        run = Run(config, folder, resuming)
+        parts = task.parts()
+        return run_parts(task, parts, run, started) if parts else run_prepared(task, run, started)
 
 
 def make_task(config: DictConfig, console: Console) -> Task:
@@ -118,6 +121,41 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
     return finish(task, run, module, trainer, started, data=data)
 
 
+def run_parts(task: Task, parts: list[Task], run: Run, started: float) -> Any:
+    """Train the parts of a task one by one, each in a folder of its own, and finish the whole.
+
+    Args:
+        task: prepared.
+        parts: of the task.
+        run, started: as for :func:`run_prepared`.
+    """
+    run.folder.mkdir(parents=True, exist_ok=True)
+    atomic_write(run.folder / CONFIG_FILE, OmegaConf.to_yaml(run.config).encode())
+    results, steps = [], 0
+    for k, part in enumerate(parts):
+        begun = time.monotonic()
+        own = Run(part.config, run.folder / f"part_{k}", resuming=run.resuming, inner=True)
+        results.append(run_prepared(part, own, begun))
+        steps += part.config.trainer.max_steps
+    result = task.joined(results)
+    task.measure(result)
+    task.save(run.folder, result)
+    _print_figures(task, run, result, time.monotonic() - started)
+    if task.config.artefacts:
+        task.write_artefacts(run.folder, result)
+    summary = {
+        "surface": task.surface.name,
+        "steps": steps,
+        "seconds": round(time.monotonic() - started, 2),
+        **task.figures(result),
+        "metrics": result.metrics,
+    }
+    atomic_write(run.folder / "metrics.json", as_json(summary))
+    if not is_temporary(run.folder):
+        task.console.print(f"results in {run.folder}", soft_wrap=True)
+    return result
+
+
 def built(task: Task) -> Any:
     """The task's module, made with the random state of the seed.
 
@@ -136,8 +174,16 @@ def built(task: Task) -> Any:
 
 
 def pictures_of(task: Task) -> Pictures:
-    """The task's pictures over the training."""
-    return Pictures(task.picture_name, task.picture, task.config.trainer.log_pictures)
+    """The task's pictures, meshes and histograms over the training."""
+    settings = task.config.trainer
+    return Pictures(
+        task.picture_name,
+        task.picture,
+        settings.log_pictures,
+        task.mesh,
+        settings.log_meshes,
+        settings.log_histograms,
+    )
 
 
 def finish(
@@ -198,9 +244,11 @@ def finish(
 def _print_figures(task: Task, run: Run, result: Any, seconds: float) -> None:
     """A table and warnings; of a neural surface that a map needs, one line."""
     if run.inner:
+        line = task.inner_line(result)
         task.console.print(
-            f"{task.surface.name}: neural surface in {seconds:.0f} s, RMS distance "
-            f"{result.metrics['rms_percent']:.3f} % of the diagonal",
+            f"{task.surface.name}: {line}, {seconds:.0f} s"
+            if line
+            else made_line(task.surface.name, result.metrics, seconds),
             soft_wrap=True,
         )
         return
@@ -208,3 +256,11 @@ def _print_figures(task: Task, run: Run, result: Any, seconds: float) -> None:
         task.console.print(task.table(result.metrics))
     for warning in task.warnings(result):
         task.console.print(warning, soft_wrap=True)
+
+
+def made_line(name: str, metrics: Mapping[str, float], seconds: float) -> str:
+    """What is said of a neural surface that a map needed, in one line."""
+    return (
+        f"{name}: neural surface in {seconds:.0f} s, RMS distance {metrics['rms_percent']:.3f} % "
+        "of the diagonal"
+    )

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from filelock import FileLock
 from omegaconf import DictConfig, open_dict
 from rich.console import Console
@@ -22,10 +23,12 @@ from nsm.maps.networks import SKIPS
 from nsm.pipeline.batched import common_settings, member, overfit_ensemble
 from nsm.pipeline.checkpoints import CHECKPOINT_FILE
 from nsm.pipeline.configured_surface import configured_surface, report_surface
-from nsm.pipeline.runner import finish, run_prepared
+from nsm.pipeline.runner import finish, made_line, run_prepared
 from nsm.pipeline.training import Run, accelerator_of, plain
 from nsm.results import NeuralSurface, load_surface
 from nsm.run_directories import temporary_folder
+from nsm.side_by_side import at_once, side_by_side
+from nsm.stages import stage
 from nsm.surfaces.cache import cache_folder
 from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit
@@ -58,6 +61,8 @@ _HARDWARE = (
     "compile",
     "log_every",
     "log_pictures",
+    "log_meshes",
+    "log_histograms",
 )
 
 
@@ -90,8 +95,8 @@ def cached_surfaces(
 ) -> list[NeuralSurface]:
     """The neural surfaces of prepared ones, from the cache if they were made before.
 
-    On a GPU, those that are missing are trained in one batch, which fills it; a CPU is as fast with
-    one after the other, and keeps more if it is interrupted.
+    On a GPU, those that are missing are trained in one batch, which fills it; on a CPU, side by
+    side, each by a process on a core of its own.
 
     Args:
         surfaces: prepared and reported ones.
@@ -109,30 +114,67 @@ def cached_surfaces(
                 _made(surface, overfit, Path(folder) / str(k), console)
                 for k, surface in enumerate(surfaces)
             ]
-    together = common_settings(settings) is not None  # not on closed domains, for instance
-    if accelerator_of(overfit) == "gpu" and together:
-        folders = {_folder_of(surface, settings): surface for surface in surfaces}
-        missing = {f: surface for f, surface in folders.items() if not is_complete(f)}
-        if len(missing) > 1:
+    folders = {_folder_of(surface, settings): surface for surface in surfaces}
+    missing = {f: surface for f, surface in folders.items() if not is_complete(f)}
+    if len(missing) > 1 and accelerator_of(overfit) == "gpu":
+        # those on closed domains, for instance, cannot be trained together
+        if settings["trainer"]["max_steps"] and common_settings(settings) is not None:
             _fill_cache(missing, overfit, console)
-    return [_cached(surface, overfit, console) for surface in surfaces]
+    elif len(missing) > 1 and settings["trainer"]["threads"] == 1:
+        _fill_side_by_side(missing, overfit, console, config.phi.get("processes"))
+    return [_cached(surface, overfit, console, known=missing) for surface in surfaces]
 
 
-def _cached(surface: Surface, overfit: DictConfig, console: Console) -> NeuralSurface:
+def _cached(
+    surface: Surface, overfit: DictConfig, console: Console, known: Collection[Path] = ()
+) -> NeuralSurface:
+    """From the cache, or made; ``known`` are folders of which it was said before that they are
+    made."""
     folder = _folder_of(surface, plain(overfit))
     with FileLock(folder.with_suffix(".lock")):  # jobs of a sweep may want the same one
         if not is_complete(folder):
             return _made(surface, overfit, folder, console)
-        console.print(f"{surface.name}: neural surface taken from the cache")
+        if folder not in known:
+            console.print(f"{surface.name}: neural surface taken from the cache")
         # equal in Ω, but perhaps of another file, with its own units, place and vertex numbers
         return replace(load_surface(folder), surface=surface)
 
 
 def _made(surface: Surface, overfit: DictConfig, folder: Path, console: Console) -> NeuralSurface:
+    if overfit.trainer.threads is not None:  # for the least-squares fit too
+        torch.set_num_threads(overfit.trainer.threads)
     run = Run(overfit, folder, resuming=(folder / CHECKPOINT_FILE).exists(), inner=True)
     started, one = time.monotonic(), member(run, surface, console)
     phi: NeuralSurface = run_prepared(one.task, run, started)
     return phi
+
+
+def _fill_side_by_side(
+    missing: dict[Path, Surface], overfit: DictConfig, console: Console, processes: int | None
+) -> None:
+    """Make the missing ones, several at once, each in a process on a core of its own."""
+    if at_once(len(missing), processes) < 2:
+        return  # one after the other shows the progress of each
+    quiet = Console(quiet=True)
+    titles = ", ".join(surface.name for surface in missing.values())
+
+    def one(surface: Surface) -> Callable[[], dict[str, float]]:
+        def make() -> dict[str, float]:
+            started = time.monotonic()
+            metrics = _cached(surface, overfit, quiet).metrics
+            return {**metrics, "seconds": time.monotonic() - started}
+
+        return make
+
+    try:
+        with stage(console, f"neural surfaces of {titles}"):
+            calls = [one(surface) for surface in missing.values()]
+            every = side_by_side(calls, processes)
+    except KeyboardInterrupt:
+        console.print("interrupted; the same command goes on")
+        raise
+    for surface, metrics in zip(missing.values(), every, strict=True):
+        console.print(made_line(surface.name, metrics, metrics["seconds"]), soft_wrap=True)
 
 
 def _fill_cache(missing: dict[Path, Surface], overfit: DictConfig, console: Console) -> None:
@@ -170,6 +212,10 @@ def _overfit_config(config: DictConfig, on: Domain) -> DictConfig:
     overfit = compose_config([*overrides, *config.phi.overrides])
     with open_dict(overfit):
         overfit.domain = on.config
+    steps = config.phi.get("steps")  # absent in older run folders
+    said = any(word.lstrip("+").startswith("trainer.max_steps=") for word in config.phi.overrides)
+    if steps is not None and not said and overfit.map.get("linear_skip") == "fitted":
+        overfit.trainer.max_steps = min(steps, overfit.trainer.max_steps)
     return overfit
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,6 +23,7 @@ from nsm.maps import AnalyticSurface, Tabulated
 from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
 from nsm.results import NeuralSurface
+from nsm.results.meshes import ColouredMesh
 from nsm.tasks.training import Training
 
 
@@ -35,15 +36,18 @@ class Given:
         phi: of task=param, a neural surface, or as ``surface``.
         source, target: of task=pair_map, as :func:`nsm.pipeline.resolve_inputs.read_shape` takes
             them.
-        surfaces: of task=collection_map, each the same.
-        landmarks: as :func:`nsm.pipeline.resolve_inputs.landmark_vertices` takes them.
+        surfaces: of task=collection_map, as :func:`nsm.pipeline.collection_inputs.collected` takes
+            them.
+        template: of task=collection_map, as ``source``.
+        landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them.
     """
 
     surface: Any = None
     phi: Any = None
     source: Any = None
     target: Any = None
-    surfaces: Sequence[Any] | None = None
+    surfaces: Any = None
+    template: Any = None
     landmarks: Any = None
 
 
@@ -71,6 +75,8 @@ class Task:
         domain: Ω.
         console: where to print.
         surface: the surface whose name and preparation metrics.json reports.
+        trained: if the task is certified, the result as it was trained, before any repair; None
+            before that.
     """
 
     module: ClassVar[type[Training]]
@@ -85,6 +91,7 @@ class Task:
     domain: Any  # nsm.domains.Domain; maps need more of it than a domain without boundary has
     console: Console
     surface: Surface
+    trained: Any = None
 
     def __init__(self, name: str = "task") -> None:
         self.name = name
@@ -204,6 +211,20 @@ class Task:
         """
         return False
 
+    def parts(self) -> list[Task]:
+        """Tasks of which this one consists, prepared, to be run one by one in folders of their own
+        (see :func:`nsm.pipeline.runner.run_parts`); none: it is trained itself."""
+        return []
+
+    def joined(self, results: list[Any]) -> Any:
+        """The result of a task that consists of parts, from theirs."""
+        raise NotImplementedError
+
+    def inner_line(self, result: Any) -> str:
+        """What is printed of a part of a task, after the surface's name; "" for a neural surface,
+        whose line the runner has."""
+        return ""
+
     def make_result(self, module: Any) -> Any:
         """The result of a module as it stands."""
         raise NotImplementedError
@@ -221,6 +242,10 @@ class Task:
 
     def picture(self, module: Any) -> np.ndarray | None:
         """A picture (H, W, 3) uint8 of the module as it stands, for the log; None: none."""
+        return None
+
+    def mesh(self, module: Any) -> ColouredMesh | None:
+        """The same as a mesh; None: none."""
         return None
 
     def save(self, folder: Path, result: Any) -> None:

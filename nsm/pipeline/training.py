@@ -26,6 +26,7 @@ from nsm.pipeline.processes import Process, raised_by, shared_steps, take_over
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
 from nsm.results.divergence_guard import DivergenceGuard
+from nsm.results.evolution import EvolutionStrip
 from nsm.results.loggers import Distributed, build_loggers, close
 from nsm.results.progress import TrainingProgress
 from nsm.results.throughput import Throughput
@@ -144,7 +145,12 @@ def trained(
     guard = DivergenceGuard(console)
     callbacks: list[Callback] = [
         guard,
-        GradientWatch(settings.log_every, _stop_norm(config), settings.stop_window),
+        GradientWatch(
+            settings.log_every,
+            settings.stop_gradient_norm,
+            settings.stop_window,
+            summed=settings.stop_norm_of == "sum",
+        ),
         AtomicCheckpoint(*(run.folder / CHECKPOINT_FILE for run in runs)),
         *_own_callbacks(config),
     ]
@@ -161,14 +167,17 @@ def trained(
     if config.logger:
         callbacks += [LearningRateMonitor(), Throughput(settings.log_every)]
         callbacks += [pictures] if pictures else []
+    if pictures and config.artefacts:
+        folders = [run.folder for run in runs]
+        callbacks.append(EvolutionStrip(pictures.draw, settings.log_pictures, folders))
     module.log_every = settings.log_every
     if settings.compile:
         module.compiled = Compiled(lambda line: console.print(line, soft_wrap=True))
-    several = settings.devices > 1
+    several = settings.devices > 1 and settings.max_steps > 0
     trainer = lightning_trainer(
         config,
         callbacks,
-        devices=settings.devices,
+        devices=settings.devices if several else 1,
         max_steps=settings.max_steps,
         strategy=shared_steps() if several else "auto",
         log_every_n_steps=settings.log_every,
@@ -212,19 +221,11 @@ def trained(
         if len(runs) > 1 or runs[0].inner:  # of a sweep, or for a map
             how = "; the same command goes on"
         console.print(f"interrupted{'' if is_temporary(folder) else how}", soft_wrap=True)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt("told")
     if several:
         take_over(trainer, folder / CHECKPOINT_FILE)
         trainer.loggers = loggers(trainer.global_step + 1)
     return trainer
-
-
-def _stop_norm(config: DictConfig) -> float | None:
-    """The norm of the mean loss's gradient under which the training stops."""
-    norm: float | None = config.trainer.stop_gradient_norm
-    if norm is None or config.trainer.stop_norm_of == "mean":
-        return norm
-    return norm / float(config.data.batch_size)
 
 
 def lightning_trainer(

@@ -5,6 +5,7 @@ from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.baking import baked
 from nsm.results.collection import SurfaceCollection, collection_metrics, load_collection
 from nsm.results.collection_pictures import figures_picture, transfer_matrix_picture
+from nsm.results.composed_map import ComposedMap, write_correspondences
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh, export_surface
@@ -24,7 +25,10 @@ from nsm.results.pictures import (
     parameterization_picture,
     reconstruction_image,
 )
-from nsm.results.surface_map import SurfaceMap, by_file_vertex, load_surface_map, on_cut_mesh
+from nsm.results.pointwise import MapSequence, SurfaceMapModule
+from nsm.results.reliability import Reliability, reliability_picture, write_reliability
+from nsm.results.stored_map import load_surface_map
+from nsm.results.surface_map import SurfaceMap
 from nsm.results.tables import (
     collection_table,
     comparison_table,
@@ -35,6 +39,7 @@ from nsm.results.tables import (
 )
 from nsm.results.textured_mesh import TexturedMesh
 from nsm.results.textures import checkerboard
+from nsm.results.vertex_values import by_file_vertex
 
 __all__ = [
     "SurfaceCollection",
@@ -43,7 +48,14 @@ __all__ = [
     "figures_picture",
     "load_collection",
     "transfer_matrix_picture",
+    "ComposedMap",
+    "Reliability",
+    "reliability_picture",
+    "write_correspondences",
+    "write_reliability",
     "SurfaceMap",
+    "MapSequence",
+    "SurfaceMapModule",
     "TexturedMesh",
     "baked",
     "analytic_surface",
@@ -71,7 +83,6 @@ __all__ = [
     "isotopy_table",
     "mean_log_distortion",
     "metrics_table",
-    "on_cut_mesh",
     "overfit_metrics",
     "parameterization_picture",
     "planar_metrics",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -13,22 +14,32 @@ from torch import Tensor, nn
 
 from nsm.domains import Surface, from_stored, stored
 from nsm.domains.surface import ARRAYS, OPTIONAL
+from nsm.energies import spectrum
+from nsm.errors import NsmError
+from nsm.maps import Placed
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
 from nsm.results.points import as_points, check_points
+from nsm.results.vertex_values import by_file_vertex
+from nsm.surfaces.holes import FIRST
 
 FORMAT = "nsm-surface"
 STEM = "surface"
+_POINTS = "points of the domain"
+_RAW = ("raw.vertices", "raw.faces")
 
 
 @dataclass(frozen=True, eq=False)
 class NeuralSurface:
     """A network φ: Ω → R³ that describes a surface, with the mesh that it was fitted to.
 
+    Called with points of Ω it gives points in the units and place of the mesh file. ``phi.map`` is
+    the network alone, whose values are normalised: centred, and scaled to the area of Ω.
+
     Attributes:
-        surface: the prepared mesh, in normalised units, as φ's values are.
-        map: the network, frozen.
+        surface: the prepared mesh, in normalised units.
+        map: the network, normalised and frozen.
         metrics: figures of :func:`nsm.results.overfit_metrics`.
         config: the settings of the run that made it.
     """
@@ -43,46 +54,114 @@ class NeuralSurface:
     @overload
     def __call__(self, uv: Tensor) -> Tensor: ...
     def __call__(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
-        """Points (N, 2) of Ω to points (N, 3) of the surface; numpy for numpy, torch for torch.
+        """Points (N, 2) of Ω to points (N, 3) of the surface, in the units of the mesh file.
+
+        numpy for numpy; for a tensor a tensor of its type, with a gradient for uv, and for the
+        network's weights after ``phi.map.requires_grad_(True)``.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type``; for arrays also ``not_finite``.
         """
         if isinstance(uv, Tensor):
-            return self.map(self._fit(uv)).to(uv.dtype)
-        return evaluate(self.map, as_points(uv, 2, "points of the domain"))
+            check_points(uv, _POINTS)
+            return self._placed(uv)
+        s = self.surface
+        return evaluate(self.map, as_points(uv, 2, _POINTS)) / s.scale + s.center
 
     @overload
     def jacobian(self, uv: np.ndarray) -> np.ndarray: ...
     @overload
     def jacobian(self, uv: Tensor) -> Tensor: ...
     def jacobian(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
-        """Jacobians (N, 3, 2) at points (N, 2) of Ω.
+        """Jacobians (N, 3, 2) at points (N, 2) of Ω: units of the mesh file per unit of Ω.
+
+        Raises:
+            NsmError: as :meth:`__call__`.
+        """
+        return self.value_and_jacobian(uv)[1]
+
+    @overload
+    def value_and_jacobian(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+    @overload
+    def value_and_jacobian(self, uv: Tensor) -> tuple[Tensor, Tensor]: ...
+    def value_and_jacobian(
+        self, uv: np.ndarray | Tensor
+    ) -> tuple[np.ndarray, np.ndarray] | tuple[Tensor, Tensor]:
+        """What :meth:`__call__` and :meth:`jacobian` give, (N, 3) and (N, 3, 2), in one pass.
 
         Raises:
             NsmError: as :meth:`__call__`.
         """
         if isinstance(uv, Tensor):
-            return self.map.value_and_jacobian(self._fit(uv))[1].to(uv.dtype)  # type: ignore[operator]
-        return evaluate_jacobian(self.map, as_points(uv, 2, "points of the domain"))[1]
+            check_points(uv, _POINTS)
+            return self._placed.value_and_jacobian(uv)
+        s = self.surface
+        value, jacobian = evaluate_jacobian(self.map, as_points(uv, 2, _POINTS))
+        return value / s.scale + s.center, jacobian / s.scale
 
-    def _fit(self, uv: Tensor) -> Tensor:
-        """Points (N, 2) in the type of the network's weights."""
-        check_points(uv, "points of the domain")
-        weight = next(self.map.parameters(), None)
-        return uv if weight is None else uv.to(weight.dtype)
+    def module(self) -> Placed:
+        """φ as a torch module from Ω to the units of the mesh file, with ``value_and_jacobian``.
+
+        Its weights are a copy, frozen: ``module().requires_grad_(True)`` trains them, and leaves
+        this surface as it is.
+        """
+        return copy.deepcopy(self._placed)
+
+    def to(self, device: torch.device | str) -> NeuralSurface:
+        """The same surface with its network on a device."""
+        return replace(self, map=copy.deepcopy(self.map).to(device))
+
+    @property
+    def _placed(self) -> Placed:
+        s = self.surface
+        return Placed(self.map, s.scale, torch.as_tensor(s.center))
+
+    def file_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """The mesh as it was given: vertices (W, 3) and faces (G, 3), in its order and units.
+
+        A surface that an older version stored has lost it: vertices and faces that the preparation
+        removed are then not there, or not in their place, and faces are in another order.
+        """
+        s = self.surface
+        if s.raw is not None:
+            return s.raw
+        return by_file_vertex(s, self.in_original_units(s.vertices)), s.file_faces()[0]
+
+    def spectrum(self, count: int = 10) -> tuple[np.ndarray, np.ndarray]:
+        """The smallest eigenvalues of the Laplace–Beltrami operator, and their functions.
+
+        See :func:`nsm.energies.spectrum`: functions are linear on the mesh's triangles of Ω, the
+        metric is that of φ, and a seam is joined.
+
+        Args:
+            count: how many, the constant function's λ = 0 among them.
+
+        Returns:
+            λ (count,), ascending, per square unit of the mesh file, and functions (W, count) at the
+            vertices of the mesh file.
+
+        Raises:
+            NsmError: ``out_of_range``: count is not from 1 to the number of vertices less one.
+        """
+        s = self.surface
+        vertex, inserted = s.source_vertex, s.source_vertex < 0
+        joined = np.where(inserted, len(s.cut_vertex) + np.arange(len(vertex)), vertex)
+        most = len(np.unique(joined)) - 1
+        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
+            message = f"count: {count!r} is not a whole number from 1 to {most}"
+            raise NsmError(message, kind="out_of_range", key="count")
+        values, functions = spectrum(self.module().cpu(), s.uv, s.faces, count, joined=joined)
+        return values, by_file_vertex(s, functions)
 
     def to_mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """φ at the mesh's vertices: (V, 3) normalised, faces (F, 3) and uv (V, 2).
+        """φ at the mesh's vertices: (V, 3) in the units of its file, faces (F, 3) and uv (V, 2).
 
         On a closed domain these are the vertices and faces of the mesh file, without copies, so
-        that the mesh is closed; uv is then one lift of each vertex.
+        that the mesh is closed; uv is then one lift of each vertex. Elsewhere they are those of the
+        cut mesh, ``surface``. Filled holes are left out.
         """
-        surface = self.surface
-        if surface.domain.has_boundary:
-            return self(surface.uv), surface.faces, surface.uv
-        first, faces = surface.whole()
-        return self(surface.uv[first]), faces, surface.uv[first]
+        uv, (shown, faces) = self.surface.uv, self.surface.shown()
+        return self(uv[shown]), faces, uv[shown]
 
     def in_original_units(self, points: np.ndarray) -> np.ndarray:
         """Normalised points (N, 3) in the units and place of the mesh file.
@@ -108,6 +187,9 @@ def save_surface(folder: str | Path, neural: NeuralSurface) -> None:
     tensors = {f"map.{key}": value for key, value in neural.map.state_dict().items()}
     for name, array in surface.arrays().items():
         tensors[f"surface.{name}"] = torch.from_numpy(np.ascontiguousarray(array).copy())
+    if surface.raw is not None:
+        for name, array in zip(_RAW, surface.raw, strict=True):
+            tensors[f"surface.{name}"] = torch.from_numpy(np.ascontiguousarray(array).copy())
     metadata = {
         "map": neural.map.config,
         "surface": {
@@ -150,12 +232,14 @@ def load_surface(folder: str | Path, trust: Iterable[str] = ()) -> NeuralSurface
         for name in OPTIONAL:
             if f"surface.{name}" in tensors:
                 arrays[name] = tensors.pop(f"surface.{name}").numpy()
+        raw = [tensors.pop(f"surface.{n}").numpy() for n in _RAW if f"surface.{n}" in tensors]
         surface = Surface(
             name=str(about["name"]),
             domain=from_stored(about["domain"], trust),
             scale=float(about["scale"]),
             quality=dict(about["quality"]),
             log=tuple(about["log"]),
+            raw=(raw[0], raw[1]) if len(raw) == 2 else None,
             **arrays,
         )
         _check_arrays(surface)
@@ -177,11 +261,11 @@ def _check_arrays(surface: Surface) -> None:
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
     for name, array in surface.arrays().items():
-        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs")
+        whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs", "ends")
         if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")
-    if len(surface.faces) == 0 or surface.source_vertex.min() < -1:
-        raise ValueError("no faces, or source_vertex below -1")
+    if len(surface.faces) == 0 or surface.source_vertex.min() < FIRST - count:
+        raise ValueError("no faces, or more filled holes than vertices")
     cut = surface.cut_vertex
     if cut.ndim != 1 or not surface.source_vertex.max() < len(cut):
         raise ValueError("source_vertex names a vertex that the mesh file does not have")
@@ -197,5 +281,13 @@ def _check_arrays(surface: Surface) -> None:
         raise ValueError("lattice is missing, or there without a closed domain")
     if surface.lattice is not None and surface.lattice.shape != (2, 2):
         raise ValueError("lattice is not (2, 2)")
+    if surface.raw is not None:
+        points, triangles = surface.raw
+        if points.shape != (len(cut), 3) or points.dtype != np.float64:
+            raise ValueError("the mesh file's vertices do not fit")
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype != np.int64:
+            raise ValueError("the mesh file's faces are no triangles")
+        if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+            raise ValueError("the mesh file's faces name a vertex that is not there")
     if not 0 < surface.scale < float("inf"):
         raise ValueError("unknown scale")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,13 @@ import numpy as np
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback
+from pytorch_lightning.loggers import Logger
 from torch.optim import Optimizer
 
 from nsm.errors import NsmError
 from nsm.results.files import flush_folder
-from nsm.results.loggers import log_picture, loggers_of, takes_pictures
+from nsm.results.loggers import event_files, log_picture, loggers_of, takes_pictures
+from nsm.results.meshes import ColouredMesh
 from nsm.tasks.ensemble import Ensemble, members
 
 
@@ -74,10 +76,14 @@ class GradientWatch(Callback):
         stop_norm: stop when the mean norm of the last ``window`` steps is below, with warm
             restarts only where a wave ends; None: never.
         window: the number of steps that are averaged.
+        summed: take the norm of the loss summed over the batch: that of the mean, which is trained
+            and logged, times the number of samples.
     """
 
-    def __init__(self, every: int, stop_norm: float | None, window: int) -> None:
-        self.every, self.stop_norm = every, stop_norm
+    def __init__(
+        self, every: int, stop_norm: float | None, window: int, *, summed: bool = False
+    ) -> None:
+        self.every, self.stop_norm, self.summed = every, stop_norm, summed
         self.recent: deque[float] = deque(maxlen=window)
 
     def on_before_optimizer_step(
@@ -105,7 +111,9 @@ class GradientWatch(Callback):
     ) -> None:
         full = len(self.recent) == self.recent.maxlen
         if self.stop_norm is not None and full and _may_stop(trainer):
-            if sum(self.recent) / len(self.recent) < self.stop_norm:
+            # each of several processes has its part of the batch
+            samples = _samples(batch) * trainer.world_size if self.summed else 1
+            if samples * sum(self.recent) / len(self.recent) < self.stop_norm:
                 trainer.should_stop = True
 
     def state_dict(self) -> dict[str, Any]:
@@ -113,6 +121,11 @@ class GradientWatch(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.recent.extend(state_dict["recent"])
+
+
+def _samples(batch: Any) -> int:
+    """How many samples a batch has: a tensor (N, ...), or a tuple of such."""
+    return len(batch if isinstance(batch, torch.Tensor) else batch[0])
 
 
 def _may_stop(trainer: pl.Trainer) -> bool:
@@ -123,34 +136,108 @@ def _may_stop(trainer: pl.Trainer) -> bool:
 
 
 class Pictures(Callback):
-    """Put pictures into the logs, evenly spread over the run.
+    """Put what is seen of a training into the logs, evenly from its start to its end.
 
     Args:
-        name: of the pictures.
+        name: of the pictures and meshes.
         draw: from the module, or that of each of several trainings in one batch, to a picture
             (H, W, 3) uint8, or None.
-        count: the number of pictures in all.
+        count: the number of pictures in all; 1: the last alone.
+        mesh: from the module to a mesh, or None.
+        meshes: the number of meshes, as of pictures, for TensorBoard.
+        histograms: of the weights and their gradients, as of pictures, for TensorBoard.
     """
 
-    def __init__(self, name: str, draw: Callable[[Any], np.ndarray | None], count: int) -> None:
-        self.name, self.draw, self.count, self.taken = name, draw, count, 0
+    def __init__(
+        self,
+        name: str,
+        draw: Callable[[Any], np.ndarray | None],
+        count: int,
+        mesh: Callable[[Any], ColouredMesh | None] = lambda module: None,
+        meshes: int = 0,
+        histograms: int = 0,
+    ) -> None:
+        self.name, self.draw, self.mesh = name, draw, mesh
+        # what is logged, how often in all, and how many of it have been
+        self.kinds = {
+            "pictures": (self._picture, count),
+            "meshes": (self._mesh, meshes),
+            "weights": (self._weights, histograms),
+            "gradients": (self._gradients, histograms),
+        }
+        self.taken = dict.fromkeys(self.kinds, 0)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if trainer.global_step == 0:
+            self._take(trainer, pl_module, 0.0)
+
+    def on_train_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        # Lightning drops the gradients before a validation
+        self._take(trainer, pl_module, trainer.global_step / trainer.max_steps, "gradients")
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if not trainer.is_global_zero or not takes_pictures(trainer.loggers):
-            return
         share = trainer.global_step / max(1, trainer.max_steps)
-        due = int(share * self.count)
-        if due <= self.taken:
+        self._take(trainer, pl_module, min(share, 0.999))  # the last are those of the end
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if trainer.global_step and not trainer.interrupted:
+            self._take(trainer, pl_module, 1.0)
+
+    def _take(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, share: float, *only: str
+    ) -> None:
+        """Log what is due at a share of the training: all but gradients, or these alone."""
+        for kind in only or ("pictures", "meshes", "weights"):
+            log, count = self.kinds[kind]
+            due = count if share == 1 else int(share * (count - 1)) + 1 if count > 1 else 0
+            if due <= self.taken[kind] and not (count and share == 1):
+                continue  # a run that is resumed after its end has another one
+            if not trainer.is_global_zero or not takes_pictures(trainer.loggers):
+                return
+            self.taken[kind] = due
+            for index, module in enumerate(members(pl_module).values()):
+                log(loggers_of(trainer.loggers, index), module, trainer.global_step)
+
+    def _picture(self, loggers: Sequence[Logger], module: Any, step: int) -> None:
+        picture = self.draw(module)
+        if picture is not None:
+            log_picture(loggers, self.name, picture, step)
+
+    def _mesh(self, loggers: Sequence[Logger], module: Any, step: int) -> None:
+        writers = event_files(loggers)
+        mesh = self.mesh(module) if writers else None
+        if mesh is None:
             return
-        self.taken = due
-        for index, module in enumerate(members(pl_module).values()):
-            picture = self.draw(module)
-            if picture is not None:
-                loggers = loggers_of(trainer.loggers, index)
-                log_picture(loggers, self.name, picture, trainer.global_step)
+        vertices, faces, colours = (torch.as_tensor(part)[None] for part in mesh)
+        for writer in writers:
+            writer.add_mesh(self.name, vertices, colours, faces, global_step=step)
+
+    def _weights(self, loggers: Sequence[Logger], module: Any, step: int) -> None:
+        for name, weights in module.named_parameters():
+            if weights.requires_grad:
+                _histogram(loggers, f"weights/{name}", weights.detach(), step)
+
+    def _gradients(self, loggers: Sequence[Logger], module: Any, step: int) -> None:
+        for name, weights in module.named_parameters():
+            if weights.grad is not None:
+                _histogram(loggers, f"gradients/{name}", weights.grad, step)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"taken": self.taken}
+        return {"taken": dict(self.taken)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.taken = state_dict["taken"]
+        taken = state_dict["taken"]
+        # earlier versions counted pictures alone
+        self.taken.update(taken if isinstance(taken, dict) else {"pictures": taken})
+
+
+def _histogram(loggers: Sequence[Logger], name: str, values: torch.Tensor, step: int) -> None:
+    for writer in event_files(loggers) if values.isfinite().all() else ():
+        writer.add_histogram(name, values, step)

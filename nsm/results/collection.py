@@ -39,7 +39,7 @@ class SurfaceCollection:
     Attributes:
         surfaces: the neural surfaces φ_i.
         maps: h_i, from the common domain to each surface's own, frozen.
-        landmarks: (L, k) vertices of the mesh files.
+        landmarks: (L, k) vertices of the mesh files; -1 where a surface lacks the landmark.
         metrics: figures of :func:`collection_metrics`.
         config: the settings of the run that made it.
         corrections: of the pairs (source, target) that :meth:`repaired` changed.
@@ -71,19 +71,25 @@ class SurfaceCollection:
         """Names of the ordered pairs, "SOURCE → TARGET"."""
         return {(i, j): f"{self.names[i]} → {self.names[j]}" for i, j in self._ordered}
 
-    def pair(self, source: int, target: int) -> SurfaceMap:
-        """The map F_{source→target} from any surface to any other, by number.
+    def pair(self, source: int | str, target: int | str) -> SurfaceMap:
+        """The map F_{source→target} from any surface to any other, by number or by name.
 
         Raises:
-            NsmError: ``out_of_range``: a number that no surface has.
+            NsmError: ``out_of_range``: a number or name that no surface has.
         """
-        for number in (source, target):
-            if number not in range(len(self)):
-                message = f"surface {number!r} is not one of 0 to {len(self) - 1}"
-                raise NsmError(message, kind="out_of_range", key="surface")
-        if (source, target) not in self._made:
-            self._made[source, target] = self._pair(source, target)
-        return self._made[source, target]
+        ends = self._number(source), self._number(target)
+        if ends not in self._made:
+            self._made[ends] = self._pair(*ends)
+        return self._made[ends]
+
+    def _number(self, surface: int | str) -> int:
+        if isinstance(surface, str) and surface in self.names:
+            return self.names.index(surface)
+        if isinstance(surface, str) or surface not in range(len(self)):
+            listing = ", ".join(self.names)
+            message = f"surface {surface!r} is not one of 0 to {len(self) - 1} ({listing})"
+            raise NsmError(message, kind="out_of_range", key="surface")
+        return int(surface)
 
     @property
     def statement(self) -> str:
@@ -122,7 +128,7 @@ class SurfaceCollection:
             self.surfaces[source],
             self.surfaces[target],
             h,
-            self.landmarks[:, [source, target]],
+            _common(self.landmarks[:, [source, target]]),
             {},
             self.config,
             self.corrections.get((source, target), Correction()),
@@ -190,7 +196,7 @@ def collection_metrics(
     Args:
         collection: the surfaces and their maps.
         points: (K, 2) landmarks in the common domain.
-        targets: (K, 2) the same in each surface's own domain.
+        targets: (K, 2) the same in each surface's own domain; NaN where it lacks the landmark.
 
     Returns:
         ``pairs``: name of the pair to the figures of :func:`nsm.results.pair_metrics` and its
@@ -204,8 +210,9 @@ def collection_metrics(
     for i, j in itertools.permutations(range(len(collection)), 2):
         f = collection.pair(i, j)
         s, t = f.source.surface, f.target.surface
-        landed = f.planar(targets[i]) if len(points) else points
-        own = pair_metrics(s, t, f.image_uv, landed, targets[j])
+        both = np.isfinite(targets[i]).all(axis=1) & np.isfinite(targets[j]).all(axis=1)
+        landed = f.planar(targets[i][both]) if both.any() else points[both]
+        own = pair_metrics(s, t, f.image_uv, landed, targets[j][both])
         pairs[collection.pair_names[i, j]] = {**own, **f.certificate}
     figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
     cycles = list(itertools.permutations(range(len(collection)), 3))
@@ -236,6 +243,11 @@ def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int)
         uv = surface.domain.canonical(evaluate(collection.pair(a, b).map, uv))
     off = np.linalg.norm(surface.at(uv) - surface.vertices[::_CYCLE_EVERY], axis=1)
     return 100 * off / surface.bounding_box_diagonal
+
+
+def _common(landmarks: np.ndarray) -> np.ndarray:
+    """The landmarks (L, 2) that both surfaces have."""
+    return np.asarray(landmarks[(landmarks >= 0).all(axis=1)])
 
 
 def _double(h: nn.Module) -> nn.Module:

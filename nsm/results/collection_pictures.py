@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -64,3 +65,20 @@ def transfer_matrix_picture(path: str | Path, collection: SurfaceCollection) -> 
             row.append((views[j].draw(t.vertices, t.faces, checked(uv), t.seam_pairs), title))
         rows.append(row)
     save_figure(panels(*rows), path)
+
+
+def cycle_picture(path: str | Path, collection: SurfaceCollection) -> None:
+    """The checkerboard of the first surface, carried to the second, the third and back to the
+    first."""
+    drawn = []
+    ring = [0, 1, 2, 0]
+    for end in range(len(ring)):
+        last = collection.surfaces[ring[end]].surface
+        uv = last.uv
+        for source, target in reversed(list(itertools.pairwise(ring[: end + 1]))):
+            f, s = collection.pair(source, target), collection.surfaces[source].surface
+            uv = s.domain.carried(uv, f.image_uv, s.uv, s.faces, s.seam_pairs)
+        view = View(last.vertices, _CELL)
+        title = " → ".join(collection.names[k] for k in ring[max(0, end - 1) : end + 1])
+        drawn.append((view.draw(last.vertices, last.faces, checked(uv), last.seam_pairs), title))
+    save_figure(panels(drawn), path)

@@ -6,11 +6,17 @@ that has stayed whole is found by its vertices. Points of others go to the neare
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.surfaces.location import Places, locate
+from nsm.surfaces.topology import equal_faces
+
+if TYPE_CHECKING:
+    from nsm.results.artifact import NeuralSurface
 
 _SAME = 1e-5  # of the mesh's size: vertices of one mesh in files of single precision
 
@@ -37,7 +43,7 @@ class FileFaces:
         # vertices of the file, with merged ones as the one they were merged with
         kept = np.where(row >= 0, surface.source_vertex[row], -1)
         there, here = kept[faces], surface.source_vertex[surface.faces]
-        file_face, surface_face = _matched(there, here)
+        file_face, surface_face = equal_faces(there, here)
         self._surface_face = np.full(len(faces), -1)
         self._surface_face[file_face] = surface_face
         self._file_face = np.full(len(here), -1)
@@ -88,15 +94,38 @@ class FileFaces:
         return Places(face, weights)
 
 
-def _matched(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of (G, 3) and of (F, 3) with the same three numbers, none negative: pairs (M,), (M,)."""
-    rows = np.sort(np.concatenate([there, here]), axis=1)
-    _, number = np.unique(rows, axis=0, return_inverse=True)
-    number = number.reshape(-1)
-    usable = np.asarray((rows >= 0).all(axis=1))
-    first = np.full(number.max() + 1, -1)
-    mine = np.flatnonzero(usable[: len(there)])[::-1]  # the first of equal faces is taken
-    first[number[mine]] = mine
-    match = np.where(usable[len(there) :], first[number[len(there) :]], -1)
-    found = np.flatnonzero(match >= 0)
-    return match[found], found
+def same_mesh(one: NeuralSurface, other: NeuralSurface) -> bool:
+    """Whether two surfaces were prepared from one mesh, perhaps cut or laid out differently."""
+    if one is other:
+        return True
+    (a, f), (b, g) = one.file_mesh(), other.file_mesh()
+    if one.surface.raw is None or other.surface.raw is None:
+        # the file's order of faces is lost
+        f, g = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (f, g))
+    if a.shape != b.shape or not np.array_equal(f, g):
+        return False
+    size = float(np.ptp(a, axis=0).max(initial=0.0))
+    return bool(np.abs(a - b).max(initial=0.0) <= _SAME * size)
+
+
+def faces_of_file(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """The surface's faces as they are in the mesh file: in its order, by its vertex numbers.
+
+    Faces that the preparation added, such as those over a hole, are left out. An older version's
+    surface has lost the file's order.
+
+    Returns:
+        Faces (G, 3) of vertices of the file, and the same corners (G, 3) as vertices of the
+        surface, whose copies at a seam are told apart.
+    """
+    faces, corners = surface.file_faces()
+    if surface.raw is None:
+        return faces, corners
+    given = surface.raw[1]
+    row = surface.cut_vertex
+    kept = np.where(row >= 0, surface.source_vertex[row], -1)[given]
+    file_face, own_face = equal_faces(kept, faces)
+    order = np.argsort(file_face, kind="stable")
+    file_face, own_face = file_face[order], own_face[order]
+    same = kept[file_face][:, :, None] == faces[own_face][:, None, :]
+    return given[file_face], np.take_along_axis(corners[own_face], same.argmax(axis=2), axis=1)

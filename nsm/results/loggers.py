@@ -7,7 +7,6 @@ import importlib.util
 import json
 import math
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,15 @@ from pytorch_lightning.loggers import (
 from nsm.errors import NsmError
 from nsm.instantiation import made_with, named_object
 from nsm.results.files import as_json, atomic_write
+from nsm.results.readable_settings import readable
 
 # which run of W&B or MLflow a folder belongs to, so that resuming goes on with it
 IDENTITY_FILE = "logger.json"
 
 
 class TensorBoard(TensorBoardLogger):
-    """Event files in the run folder, under ``tensorboard``.
+    """Event files in the run folder, under ``tensorboard``: one run of TensorBoard for each job,
+    without Lightning's curve of epochs.
 
     Args:
         folder: the run folder.
@@ -46,6 +47,9 @@ class TensorBoard(TensorBoardLogger):
             default_hp_metric=False,
             purge_step=first_step,
         )
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        super().log_metrics({k: v for k, v in metrics.items() if k != "epoch"}, step)
 
 
 class CSV(CSVLogger):
@@ -212,9 +216,18 @@ def loggers_of(loggers: Sequence[Logger], index: int) -> Sequence[Logger]:
 def takes_pictures(loggers: Sequence[Logger]) -> bool:
     """Whether pictures have a place in any of the logs."""
     kinds = (TensorBoardLogger, WandbLogger, MLFlowLogger)
+    return any(isinstance(logger, kinds) for logger in _every(loggers))
+
+
+def event_files(loggers: Sequence[Logger]) -> list[Any]:
+    """The ``SummaryWriter`` of each TensorBoard among loggers, for what no other log takes."""
+    every = _every(loggers)
+    return [logger.experiment for logger in every if isinstance(logger, TensorBoardLogger)]
+
+
+def _every(loggers: Sequence[Logger]) -> Sequence[Logger]:
     first = loggers[0] if loggers else None
-    every = first.all() if isinstance(first, Distributed) else loggers
-    return any(isinstance(logger, kinds) for logger in every)
+    return first.all() if isinstance(first, Distributed) else loggers
 
 
 def log_picture(loggers: Sequence[Logger], name: str, image: np.ndarray, step: int) -> None:
@@ -234,15 +247,13 @@ def log_figures(
 ) -> None:
     """Put a run's final figures into its logs, beside its settings, and close them.
 
-    TensorBoard has them as a run of its own, ``figures``, so that its HPARAMS tab compares runs by
-    these alone.
+    TensorBoard's HPARAMS tab compares runs by them.
     """
     figures = {f"figures/{name}": value for name, value in headline(metrics).items()}
     for logger in loggers:
+        logger.log_metrics(figures, step)
         if isinstance(logger, TensorBoardLogger):
-            _compare(Path(logger.log_dir) / "figures", flattened(settings), figures, step)
-        else:
-            logger.log_metrics(figures, step)
+            _compare(logger.experiment, settings, figures)
     close(loggers, "success")
 
 
@@ -254,19 +265,20 @@ def close(loggers: Sequence[Logger], status: str) -> None:
             logger.experiment.finish(exit_code=0 if status == "success" else 1)
 
 
-def _compare(folder: Path, flat: dict[str, Any], figures: dict[str, float], step: int) -> None:
-    from torch.utils.tensorboard import SummaryWriter
+def _compare(writer: Any, settings: Mapping[str, Any], figures: dict[str, float]) -> None:
+    """Make a run of TensorBoard a row of its HPARAMS tab: choices by name, settings, figures."""
     from torch.utils.tensorboard.summary import hparams
 
-    shutil.rmtree(folder, ignore_errors=True)  # of the same run, resumed after its end
+    flat = {k: _cell(v) for k, v in readable(settings).items() if v is not None}
     # no experiment summary: TensorBoard takes the first that it finds for all runs, while without
-    # one it unites the settings and figures of all
+    # one it unites the settings of all, with those that differ first
     _, start, end = hparams(flat, figures)
-    with SummaryWriter(folder) as writer:
-        writer.file_writer.add_summary(start)
-        writer.file_writer.add_summary(end)
-        for name, value in figures.items():
-            writer.add_scalar(name, value, step)
+    writer.file_writer.add_summary(start)
+    writer.file_writer.add_summary(end)
+
+
+def _cell(value: Any) -> bool | int | float | str:
+    return value if isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def headline(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -292,5 +304,5 @@ def flattened(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping):
             flat.update(flattened(value, f"{name}."))
         else:
-            flat[name] = value if isinstance(value, (bool, int, float, str)) else str(value)
+            flat[name] = _cell(value)
     return flat

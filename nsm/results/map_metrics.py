@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from nsm.domains.planar_mesh import boundary_self_intersections, signed_areas
-from nsm.energies import area, singular_value_ratio, symmetric_dirichlet
+from nsm.energies import area, conformal, singular_value_ratio, symmetric_dirichlet
 from nsm.surfaces.topology import boundary_loops, face_areas
 
 
@@ -33,21 +33,32 @@ def summaries(values: Mapping[str, np.ndarray], weights: np.ndarray) -> dict[str
     return figures
 
 
+def flipped_percent(uv: np.ndarray, faces: np.ndarray, *, mirrored: bool = False) -> float:
+    """Share of the triangles (F, 3) that images (V, 2) turn over or flatten, in percent.
+
+    Args:
+        uv, faces: the image of a mesh.
+        mirrored: whether the map may be a mirror image as a whole: the minority is then counted.
+    """
+    signed = signed_areas(uv, faces)
+    turned = int((signed <= 0).sum())
+    return 100 * (min(turned, int((signed >= 0).sum())) if mirrored else turned) / len(faces)
+
+
 def planar_metrics(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> dict[str, float]:
     """Figures of a map of a mesh (V, 3), (F, 3) to the plane (V, 2).
 
     Returns:
-        median, mean and p95 of symmetric_dirichlet, singular_value_ratio and area over the
-        triangles, the mean weighted by their area on the mesh; flipped_percent, of the minority's
-        orientation; boundary_self_intersections: a map without flips can still overlap itself.
+        median, mean and p95 of symmetric_dirichlet (METHOD, Eq. 2), conformal (Eq. 3),
+        singular_value_ratio and area over the triangles, the mean weighted by their area on the
+        mesh; flipped_percent, of the minority's orientation; boundary_self_intersections:
+        a map without flips can still overlap itself.
     """
     source, image = triangle_metric(vertices, faces), triangle_metric(uv, faces)
-    energies = (symmetric_dirichlet, singular_value_ratio, area)
+    energies = (symmetric_dirichlet, conformal, singular_value_ratio, area)
     values = {energy.__name__: energy(source, image).numpy() for energy in energies}
     figures = summaries(values, face_areas(vertices, faces))
-    signed = signed_areas(uv, faces)
-    flipped = min(int((signed <= 0).sum()), int((signed >= 0).sum()))
-    figures["flipped_percent"] = 100 * flipped / len(faces)
+    figures["flipped_percent"] = flipped_percent(uv, faces, mirrored=True)
     loop = boundary_loops(faces)[0]
     figures["boundary_self_intersections"] = float(boundary_self_intersections(uv, loop))
     return figures

@@ -4,15 +4,36 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
+from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
 from nsm.results.textures import checkerboard, checkerboard_at
+from nsm.results.vertex_values import mean_by_file_vertex
+
+
+class ColouredMesh(NamedTuple):
+    """Vertices (V, 3), faces (F, 3), and colours (V, 3) uint8 of the vertices."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray
+
+
+def painted(vertices: np.ndarray, faces: np.ndarray, source: np.ndarray) -> ColouredMesh:
+    """A mesh (V, 3), (F, 3) with the colours of its vertices' places (V, 3) on the source."""
+    return ColouredMesh(vertices, faces, np.round(255 * by_position(source)).astype(np.uint8))
+
+
+def by_position(vertices: np.ndarray) -> np.ndarray:
+    """Colours (V, 3) in [0, 1] by place in the bounding box."""
+    low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    return np.asarray((vertices - low) / np.maximum(extent, 1e-12))
 
 
 def export_mesh(
@@ -65,22 +86,44 @@ def export_mesh(
     atomic_write(target, "".join(lines).encode())
 
 
+def export_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a mesh (V, 3), (F, 3) as a binary PLY file in double precision, in the given order."""
+    from plyfile import PlyData, PlyElement
+
+    points = np.empty(len(vertices), dtype=[(axis, "f8") for axis in "xyz"])
+    for axis, column in zip("xyz", np.asarray(vertices).T, strict=True):
+        points[axis] = column
+    triangles = np.empty(len(faces), dtype=[("vertex_indices", "i4", (3,))])
+    triangles["vertex_indices"] = faces
+    stream = io.BytesIO()
+    elements = [PlyElement.describe(points, "vertex"), PlyElement.describe(triangles, "face")]
+    PlyData(elements, byte_order="<").write(stream)
+    atomic_write(path, stream.getvalue())
+
+
 def export_surface(
     path: str | Path, vertices: np.ndarray, surface: Surface, uv: np.ndarray
 ) -> None:
     """Write a surface's mesh with other vertices (V, 3), and a checkerboard over coordinates uv
     (V, 2); arguments and errors as for :func:`export_mesh`.
 
-    A surface on a closed domain is written whole, with the vertices and faces of its file and
-    without coordinates.
+    An OBJ file has the vertices and faces of the surface's file, in its order: the copies of a seam
+    vertex go to their mean, and keep their own texture coordinates. A GLB file has a vertex for
+    each copy. A surface on a closed domain is written whole, without coordinates. Filled holes are
+    left out.
     """
-    glb = Path(path).suffix.lower() == ".glb"
-    if surface.domain.has_boundary:
-        export_mesh(path, vertices, surface.faces, uv, texture=checkerboard() if glb else None)
+    bounded = surface.domain.has_boundary
+    if Path(path).suffix.lower() == ".glb":
+        shown, faces = surface.shown()
+        points, own = vertices[shown], uv[shown]
+        if bounded:
+            export_mesh(path, points, faces, own, texture=checkerboard())
+        else:
+            export_mesh(path, points, faces, None, colours=checkerboard_at(own))
         return
-    first, faces = surface.whole()
-    colours = checkerboard_at(uv[first]) if glb else None
-    export_mesh(path, vertices[first], faces, None, colours=colours)
+    faces, corners = faces_of_file(surface)
+    points = mean_by_file_vertex(surface, vertices)
+    export_mesh(path, points, faces, uv if bounded else None, corners=corners)
 
 
 def _glb(

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from nsm.domains import Surface, bounded
-from nsm.domains.planar_mesh import signed_areas
 from nsm.energies import (
     arap,
     area,
@@ -20,7 +19,7 @@ from nsm.energies import (
     singular_value_ratio,
     symmetric_dirichlet,
 )
-from nsm.results.map_metrics import summaries, triangle_metric
+from nsm.results.map_metrics import flipped_percent, summaries, triangle_metric
 from nsm.surfaces.topology import boundary_loops, face_areas
 
 ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
@@ -29,6 +28,13 @@ ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
     singular_value_ratio,
     area,
     arap,
+)
+# what is said of a map before its optimization
+START = (
+    *(f"symmetric_dirichlet_{name}" for name in ("median", "mean", "p95")),
+    "singular_value_ratio_median",
+    "flipped_percent",
+    "landmark_error_max_percent",
 )
 # precision of a boundary point in float32
 ON_BOUNDARY = 1e-6
@@ -97,9 +103,8 @@ def pair_metrics(
     image = target.at(image_uv)
     to_percent = 100 / target.bounding_box_diagonal
     figures = distortion_figures(source.vertices, image, source.faces)
-    figures["flipped_percent"] = 100 * float((signed_areas(image_uv, source.faces) <= 0).mean())
-    off = target.at(landmark_image) - target.at(landmark_target)
-    distances = {"landmark_error": np.linalg.norm(off, axis=1)}
+    figures["flipped_percent"] = flipped_percent(image_uv, source.faces)
+    distances = {"landmark_error": _missed(target, landmark_image, landmark_target)}
     if source.domain.has_boundary:
         distance = bounded(source.domain).signed_distance(torch.from_numpy(image_uv)).numpy()
         loop = boundary_loops(source.faces)[0]
@@ -113,6 +118,38 @@ def pair_metrics(
             figures[f"{name}_max_percent"] = float(values.max() * to_percent)
     figures["covered_percent"] = _covered_percent(source, target, image_uv)
     return figures
+
+
+def start_figures(
+    source: Surface,
+    target: Surface,
+    image_uv: np.ndarray,
+    landmark_image: np.ndarray,
+    landmark_target: np.ndarray,
+) -> dict[str, float]:
+    """Figures of a map before its optimization: the parameterizations of both surfaces, composed.
+
+    Args:
+        source, target, image_uv, landmark_image, landmark_target: as for :func:`pair_metrics`, of
+            the map that h starts as.
+
+    Returns:
+        symmetric_dirichlet_median, _mean and _p95; singular_value_ratio_median; flipped_percent;
+        landmark_error_max_percent, if there are landmarks: each after ``start_``.
+    """
+    figures = distortion_figures(source.vertices, target.at(image_uv), source.faces)
+    figures["flipped_percent"] = flipped_percent(image_uv, source.faces)
+    if len(landmark_image):
+        off = _missed(target, landmark_image, landmark_target)
+        figures["landmark_error_max_percent"] = (
+            100 / target.bounding_box_diagonal * float(off.max())
+        )
+    return {f"start_{name}": figures[name] for name in START if name in figures}
+
+
+def _missed(target: Surface, image: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Distances (K,) on the target between points (K, 2) of its domain."""
+    return np.linalg.norm(target.at(image) - target.at(wanted), axis=1)
 
 
 def _covered_percent(source: Surface, target: Surface, image_uv: np.ndarray) -> float:

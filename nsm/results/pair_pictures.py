@@ -13,34 +13,40 @@ from PIL import Image
 
 from nsm.domains import Surface
 from nsm.energies import symmetric_dirichlet
+from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
-from nsm.results.pictures import PANEL, checked, panels, save_figure, vertex_means
-from nsm.results.render import Blend, View
+from nsm.results.meshes import by_position
+from nsm.results.pictures import PANEL, by_normals, checked, panels, save_figure, vertex_means
+from nsm.results.render import Blend, View, vertex_normals
+from nsm.results.spheres import Spheres
 from nsm.results.surface_map import SurfaceMap
 
 _STRIP, _GIF = 300, 300
-_TICKS = [4, 5, 7, 10, 20]
-_WORST = 20.0  # the colour scale of symmetric Dirichlet goes from 4 to this
+_LEAST, _WORST = LEAST_SYMMETRIC_DIRICHLET, 20.0  # ends of the colour scale
+_TICKS = [_LEAST, 5, 7, 10, 20]
+_SCALE = ScalarMappable(LogNorm(_LEAST, _WORST), "viridis")
 
 
 def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     """The source's checkerboard and colours of position, beside both transferred to the target.
 
-    The target is drawn with its own triangles, aligned with the source.
+    The target is drawn with its own triangles, aligned with the source. Landmarks are spheres, of
+    one colour for the two of a pair.
     """
     s, t = f.source.surface, f.target.surface
     target = f.aligned(t.vertices)
-    low, extent = s.vertices.min(axis=0), np.ptp(s.vertices, axis=0)
-    colours = (s.vertices - low) / np.maximum(extent, 1e-12)
+    colours = by_position(s.vertices)
     carried = f._back.take(colours, s.faces)
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
 
     def at_source(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        return left.draw(s.vertices, s.faces, paint, s.seam_pairs)
+        spheres = Spheres(s.vertices, s.faces, s.cut_vertex[f.landmarks[:, 0]])
+        return left.draw(*spheres.mesh, spheres.painted(paint), s.seam_pairs)
 
     def at_target(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        return right.draw(target, t.faces, paint, t.seam_pairs)
+        spheres = Spheres(target, t.faces, t.cut_vertex[f.landmarks[:, 1]])
+        return right.draw(*spheres.mesh, spheres.painted(paint), t.seam_pairs)
 
     rows = [
         [
@@ -55,27 +61,39 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     save_figure(panels(*rows), path)
 
 
+def normals_picture(path: str | Path, f: SurfaceMap) -> None:
+    """The source coloured by its normals, and these colours transferred to the target, such as an
+    analytic surface: features that its shape does not have show where the source's come to lie."""
+    s, t = f.source.surface, f.target.surface
+    normals = vertex_normals(s.vertices, s.faces, s.seam_pairs)
+    left, right = View(s.vertices, PANEL), View(t.vertices, PANEL)
+    carried = f._back.take(normals, s.faces)
+    panel = [
+        (left.draw(s.vertices, s.faces, by_normals(normals), s.seam_pairs), f"{s.name}: normals"),
+        (
+            right.draw(t.vertices, t.faces, by_normals(carried), t.seam_pairs),
+            f"transferred to {t.name}",
+        ),
+    ]
+    save_figure(panels(panel), path)
+
+
 def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     """Symmetric Dirichlet on the source and on its image, with its histogram."""
     s = f.source.surface
-    value = symmetric_dirichlet(
-        triangle_metric(s.vertices, s.faces), triangle_metric(f.image, s.faces)
-    ).numpy()
-    at_vertex = vertex_means(np.minimum(value, 1e3), s.faces, len(s.vertices))
-    scale = ScalarMappable(LogNorm(4, _WORST), "viridis")
-    colours = scale.to_rgba(at_vertex)[:, :3]
-
-    def paint(blend: Blend) -> np.ndarray:
-        return blend(colours)
-
+    value = _energy(s, f.image)
+    scale, colours = _SCALE, _coloured(s, value)
     view = View(s.vertices, PANEL)
     image = f.aligned_image
     other = View(image, PANEL, frame=view.frame)
     figure = panels(
         [
-            (view.draw(s.vertices, s.faces, paint, s.seam_pairs), f"{s.name}: symmetric Dirichlet"),
             (
-                other.draw(image, s.faces, paint, s.seam_pairs),
+                view.draw(s.vertices, s.faces, lambda blend: blend(colours), s.seam_pairs),
+                f"{s.name}: symmetric Dirichlet",
+            ),
+            (
+                other.draw(image, s.faces, lambda blend: blend(colours), s.seam_pairs),
                 f"its image on {f.target.surface.name}",
             ),
             (np.ones((PANEL, PANEL, 3)), ""),
@@ -85,7 +103,9 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     axes.clear()
     axes.set_aspect("auto")
     axes.set_position((0.64, 0.14, 0.24, 0.74))
-    axes.hist(np.clip(value, 4, _WORST), bins=np.geomspace(4, _WORST, 60), color="#345c8c")
+    axes.hist(
+        np.clip(value, _LEAST, _WORST), bins=np.geomspace(_LEAST, _WORST, 60), color="#345c8c"
+    )
     axes.set_xscale("log")
     axes.set_xticks(_TICKS, [*map(str, _TICKS[:-1]), f"≥ {_TICKS[-1]}"])
     axes.set_xticks([], minor=True)
@@ -96,17 +116,37 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     save_figure(figure, path)
 
 
+def distorted(view: View, surface: Surface, image: np.ndarray) -> np.ndarray:
+    """A surface coloured by the symmetric Dirichlet energy of its map to ``image`` (V, 3)."""
+    colours = _coloured(surface, _energy(surface, image))
+    vertices, faces = surface.vertices, surface.faces
+    return view.draw(vertices, faces, lambda blend: blend(colours), surface.seam_pairs)
+
+
+def _energy(surface: Surface, image: np.ndarray) -> np.ndarray:
+    """Symmetric Dirichlet (F,) of the map of a surface's triangles to ``image`` (V, 3)."""
+    before, after = (triangle_metric(v, surface.faces) for v in (surface.vertices, image))
+    return np.asarray(symmetric_dirichlet(before, after).numpy())
+
+
+def _coloured(surface: Surface, value: np.ndarray) -> np.ndarray:
+    """Colours (V, 3) of values (F,) of its triangles."""
+    at_vertex = vertex_means(np.minimum(value, 1e3), surface.faces, len(surface.vertices))
+    return np.asarray(_SCALE.to_rgba(at_vertex)[:, :3])
+
+
 def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> None:
     """The morph from source to target: five pictures in a row, and a GIF, back and forth."""
     s = f.source.surface
-    both = np.concatenate([s.vertices, f.aligned_image])
+    start, end = s.vertices, f.aligned_image
+    both = np.concatenate([start, end])
     frame = View(s.vertices, 8).frame
 
     def draw(t: float, size: int) -> np.ndarray:
         view = View(both, size, frame=frame)
-        return np.round(255 * view.draw(f.morph(t), s.faces, checked(s.uv), s.seam_pairs)).astype(
-            np.uint8
-        )
+        points = (1 - t) * start + t * end
+        picture = view.draw(points, s.faces, checked(s.uv), s.seam_pairs)
+        return np.round(255 * picture).astype(np.uint8)
 
     row = np.concatenate([draw(t, _STRIP) for t in np.linspace(0, 1, 5)], axis=1)
     data = io.BytesIO()

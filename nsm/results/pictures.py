@@ -15,9 +15,12 @@ from matplotlib.figure import Figure
 from torch import nn
 
 from nsm.domains import Surface
+from nsm.energies import conformal, symmetric_dirichlet
+from nsm.results.evaluation import evaluate, evaluate_jacobian
 from nsm.results.files import atomic_write
-from nsm.results.metrics import evaluate, vertex_error
-from nsm.results.render import Blend, View
+from nsm.results.map_metrics import triangle_metric
+from nsm.results.metrics import vertex_error
+from nsm.results.render import Blend, View, vertex_normals
 from nsm.results.textures import checkerboard_at
 from nsm.surfaces.geometry import subdivide
 
@@ -31,7 +34,8 @@ _FINE_FACES = 30_000
 
 
 def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
-    """Source beside reconstruction, coloured by distance in percent of the diagonal."""
+    """Source beside reconstruction, coloured by distance in percent of the diagonal; below, both
+    coloured by their normals."""
     error = vertex_error(surface, neural.map)
     scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
     view = View(surface.vertices, PANEL)
@@ -45,19 +49,45 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     )
     rms = neural.metrics.get("rms_percent")
     title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
-    figure = panels([(source, f"{surface.name}: mesh"), (image, title)])
+    off = neural.metrics.get("normal_error_mean_degrees")
+    normals = [
+        vertex_normals(surface.vertices, surface.faces, surface.seam_pairs),
+        neural_normals(neural.map, surface.uv),
+    ]
+    below = [
+        (
+            view.draw(x, surface.faces, by_normals(normal), surface.seam_pairs),
+            "normals" + (f", mean error {off:.2f}°" if k and off is not None else ""),
+        )
+        for k, (x, normal) in enumerate(
+            zip((surface.vertices, evaluate(neural.map, surface.uv)), normals, strict=True)
+        )
+    ]
+    figure = panels([(source, f"{surface.name}: mesh"), (image, title)], below)
     figure.colorbar(
         scale,
-        cax=figure.add_axes((0.91, 0.2, 0.012, 0.6)),
+        cax=figure.add_axes((0.91, 0.55, 0.012, 0.35)),
         label="distance, % of the diagonal",
         extend="max",
     )
     save_figure(figure, path)
 
 
+def neural_normals(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of φ at points (N, 2) of Ω; zero where its Jacobian is degenerate."""
+    jacobian = evaluate_jacobian(phi, uv)[1]
+    cross = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
+    return cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-30)[:, None]
+
+
+def by_normals(normals: np.ndarray) -> Callable[[Blend], np.ndarray]:
+    """Colours for :meth:`View.draw`: unit normals (V, 3) as red, green and blue."""
+    return lambda blend: (0.5 * (1 + blend(normals))).clip(0, 1)
+
+
 def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
     """The neural surface with Ω's checkerboard on it, beside Ω."""
-    uv, faces = _fine(surface)
+    uv, faces = fine(surface)
     image = View(surface.vertices, PANEL).draw(
         evaluate(neural.map, uv), faces, lambda blend: checkerboard_at(blend(uv))
     )
@@ -72,7 +102,7 @@ def checkerboard_picture(path: str | Path, surface: Surface, neural: NeuralSurfa
 
 def reconstruction_image(surface: Surface, phi: nn.Module, *, size: int = 384) -> np.ndarray:
     """A quick picture (size, size, 3) uint8 of φ."""
-    uv, faces = _fine(surface)
+    uv, faces = fine(surface)
     picture = View(surface.vertices, size).draw(evaluate(phi, uv), faces, _grey)
     return np.round(255 * picture).astype(np.uint8)
 
@@ -81,7 +111,8 @@ def _grey(blend: Blend) -> np.ndarray:
     return GREY
 
 
-def _fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+def fine(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Points of Ω (N, 2) and faces (M, 3): the mesh, subdivided until it shows the shape of φ."""
     uv, faces = surface.uv, surface.faces
     while len(faces) < _FINE_FACES:
         uv, faces = subdivide(uv, faces)
@@ -93,15 +124,24 @@ def parameterization_picture(
 ) -> None:
     """For each named map (V, 2): its checkerboard on the mesh, above its layout in the plane.
 
-    The squares have one size everywhere, so that their images show area and angle distortion.
+    The squares have one size everywhere, so that their images show area and angle distortion. The
+    titles have the medians of D_iso (symmetric Dirichlet) and D_conf over the triangles.
     """
     view = View(surface.vertices, PANEL)
     above = [
         (view.draw(surface.vertices, surface.faces, checked(uv), surface.seam_pairs), name)
         for name, uv in maps.items()
     ]
-    below = [(layout_image(surface, uv, size=PANEL), "") for uv in maps.values()]
+    below = [(layout_image(surface, uv, size=PANEL), _medians(surface, uv)) for uv in maps.values()]
     save_figure(panels(above, below), path)
+
+
+def _medians(surface: Surface, uv: np.ndarray) -> str:
+    source, image = (triangle_metric(x, surface.faces) for x in (surface.vertices, uv))
+    isometric, conformally = (
+        float(energy(source, image).median()) for energy in (symmetric_dirichlet, conformal)
+    )
+    return f"D_iso {isometric:.2f}, D_conf {conformally:.4f}"
 
 
 def layout_image(surface: Surface, uv: np.ndarray, *, size: int = 384) -> np.ndarray:

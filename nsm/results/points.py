@@ -46,15 +46,15 @@ def as_values(given: Any, name: str, *, kinds: str = "fiubc") -> np.ndarray:
     return values
 
 
-def check_points(given: Tensor, name: str) -> None:
-    """Refuse a tensor that is not (N, 2) of floating point.
+def check_points(given: Tensor, name: str, *, columns: int = 2) -> None:
+    """Refuse a tensor that is not (N, columns) of floating point.
 
     The values are not looked at, which would wait for the GPU.
 
     Raises:
         NsmError: ``wrong_shape``, with the name as key.
     """
-    if given.ndim != 2 or given.shape[1] != 2 or not given.is_floating_point():
-        shape = tuple(given.shape)
-        message = f"{name}: give a tensor (N, 2) of floating point, not {given.dtype} {shape}"
+    if given.ndim != 2 or given.shape[1] != columns or not given.is_floating_point():
+        kind = f"{given.dtype} {tuple(given.shape)}"
+        message = f"{name}: give a tensor (N, {columns}) of floating point, not {kind}"
         raise NsmError(message, kind="wrong_shape", key=name)

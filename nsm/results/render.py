@@ -19,6 +19,19 @@ _CHUNK = 4_000_000  # pixel tests at once
 _LIGHT = np.array([-0.35, 0.55, 0.75]) / np.linalg.norm([-0.35, 0.55, 0.75])
 
 
+# rotations of each axis to y, the upward axis of a view
+UP_AXES = {
+    sign + axis: flip @ np.roll(np.eye(3), -k, axis=0)
+    for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
+    for k, axis in enumerate("yzx")
+}
+
+
+def frames_of(vertices: np.ndarray) -> dict[str, np.ndarray]:
+    """The good view (see :func:`view_frame`) of a mesh (V, 3) by the axis that points up."""
+    return {axis: view_frame(vertices @ turn.T) @ turn for axis, turn in UP_AXES.items()}
+
+
 def view_frame(vertices: np.ndarray) -> np.ndarray:
     """Rows right, up and towards the viewer (3, 3) of a good view of a mesh.
 

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
+import torch
 from scipy.sparse import csr_matrix
-from torch import nn
+from torch import Tensor, nn
 
-from nsm.domains import Surface
 from nsm.errors import NsmError
-from nsm.results.artifact import NeuralSurface, load_surface, save_surface
+from nsm.results.artifact import NeuralSurface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired, statement
-from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
+from nsm.results.composed_map import ComposedMap, composed, correspondence_matrix, transferred
+from nsm.results.file_faces import FileFaces
+from nsm.results.files import write_pair
 from nsm.results.metrics import evaluate
-from nsm.results.networks import placed_map
-from nsm.results.points import as_points, as_values
-from nsm.results.textured_mesh import LARGEST_SIZE, TexturedMesh, painted, read_file_mesh
+from nsm.results.morph_target import write_morph
+from nsm.results.points import as_points
+from nsm.results.pointwise import SurfaceMapModule, fixed_image, located, moved, value_and_jacobian
+from nsm.results.reliability import Reliability, reliability
+from nsm.results.textured_mesh import TexturedMesh, painted_by
+from nsm.results.vertex_values import by_file_vertex
 from nsm.results.welding import Weld, weld
-from nsm.surfaces.location import Places, locate
-from nsm.surfaces.textures import read_texture
+from nsm.surfaces.location import Places
 
 FORMAT = "nsm-surface-map"
 STEM = "pair"
@@ -58,30 +62,126 @@ class SurfaceMap:
     correction: Correction = field(default_factory=Correction, repr=False)
     vertex_image: np.ndarray | None = field(default=None, repr=False)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
+    @overload
+    def __call__(self, points: np.ndarray) -> np.ndarray: ...
+    @overload
+    def __call__(self, points: Tensor) -> Tensor: ...
+    def __call__(self, points: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 3) anywhere on the source surface to points (N, 3) of the target.
 
-        Points off the source start from the nearest point on it.
+        Points off the source start from the nearest point on it. For a tensor the result is one of
+        its type, on its device, with a gradient for the points; :meth:`module` has one for the
+        weights of h too.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
+        if isinstance(points, Tensor):
+            return moved(self, points, fixed_image(self))
         s, t = self.source.surface, self.target.surface
-        image = _located(s, points, "points on the source").take(self.image_uv, s.faces)
+        image = located(s, points, "points on the source").take(self.image_uv, s.faces)
         return self.target.in_original_units(t.at(image))
 
-    def inverse(self, points: np.ndarray) -> np.ndarray:
+    @overload
+    def inverse(self, points: np.ndarray) -> np.ndarray: ...
+    @overload
+    def inverse(self, points: Tensor) -> Tensor: ...
+    def inverse(self, points: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 3) anywhere on the target to those (N, 3) of the source that f sends there.
 
-        Points off the target start from the nearest point on it.
+        Points off the target start from the nearest point on it. Tensors as for :meth:`__call__`.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
+        if isinstance(points, Tensor):
+            return moved(self, points, fixed_image(self), back=True)
         s, t = self.source.surface, self.target.surface
-        uv = _located(t, points, "points on the target").take(t.uv, t.faces)
+        uv = located(t, points, "points on the target").take(t.uv, t.faces)
         preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
         return self.source.in_original_units(s.at(preimage))
+
+    @overload
+    def value_and_jacobian(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+    @overload
+    def value_and_jacobian(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
+    def value_and_jacobian(
+        self, points: np.ndarray | Tensor
+    ) -> tuple[np.ndarray, np.ndarray] | tuple[Tensor, Tensor]:
+        """Images (N, 3) of points (N, 3) of the source, and Jacobians (N, 3, 3).
+
+        A Jacobian takes tangent vectors of the source to tangent vectors of the target, in the
+        units of the files, and the source's normal to zero. It is constant on the pieces of
+        triangles on which the map is affine.
+
+        Raises:
+            NsmError: as :meth:`__call__`.
+        """
+        if isinstance(points, Tensor):
+            return value_and_jacobian(self, points, fixed_image(self))
+        given = torch.from_numpy(as_points(points, 3, "points on the source"))
+        value, jacobian = value_and_jacobian(self, given, fixed_image(self))
+        return value.numpy(), jacobian.numpy()
+
+    def __matmul__(self, other: SurfaceMap | ComposedMap) -> ComposedMap:
+        """``g @ f``, the map x ↦ g(f(x)), where f ends on the mesh that g starts from.
+
+        Raises:
+            NsmError: ``wrong_mesh``: f ends on another mesh.
+        """
+        return composed(self, other)
+
+    def module(self) -> SurfaceMapModule:
+        """f as a torch module on points (N, 3), whose weights, those of h, can be trained."""
+        return SurfaceMapModule(self)
+
+    def to(self, device: torch.device | str) -> SurfaceMap:
+        """The same map with its networks on a device."""
+        return replace(
+            self,
+            source=self.source.to(device),
+            target=self.target.to(device),
+            map=copy.deepcopy(self.map).to(device),
+            vertex_image=self._uncorrected,
+        )
+
+    def correspondences(self, *, back: bool = False) -> Places:
+        """Where each vertex of the source's mesh file goes on the mesh of the target's.
+
+        The copies of a vertex on a seam have one image (see :attr:`weld`). Vertices that are not on
+        the surface, such as those of a part that was left out, go with the nearest point on it.
+
+        Args:
+            back: where each vertex of the target's file comes from on the source's mesh.
+
+        Returns:
+            face (W,), the rows of ``target.file_mesh()``'s faces, and barycentric coordinates
+            (W, 3) in them: ``face, weights = f.correspondences()``.
+        """
+        return self._corresponding_back if back else self._corresponding
+
+    @cached_property
+    def _corresponding(self) -> Places:
+        return self._on_file_faces(self.target, back=False)
+
+    @cached_property
+    def _corresponding_back(self) -> Places:
+        return self._on_file_faces(self.source, back=True)
+
+    def _on_file_faces(self, end: NeuralSurface, back: bool) -> Places:
+        files = FileFaces(end.surface, *end.file_mesh(), end.surface.name)
+        return files.to_file(self._of_file_vertices(back))
+
+    def _of_file_vertices(self, back: bool) -> Places:
+        start = self.target if back else self.source
+        own = self._back if back else self.weld.places
+        face, weights = (by_file_vertex(start.surface, array) for array in own)
+        absent = np.flatnonzero(start.surface.cut_vertex < 0)
+        if len(absent):
+            points = start.file_mesh()[0][absent]
+            near = self.places(located(start.surface, points, "vertices"), back=back)
+            face[absent], weights[absent] = near
+        return Places(face, weights)
 
     def planar(self, uv: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the source's domain to those of the target's, (N, 2).
@@ -157,7 +257,8 @@ class SurfaceMap:
     def welded_image(self) -> np.ndarray:
         """Images (W, 3) of the mesh file's vertices on the target, welded, in normalised units;
         with the faces of ``weld`` the image of a closed mesh is closed."""
-        return by_file_vertex(self.source.surface, self.weld.points)
+        t = self.target.surface
+        return self._of_file_vertices(False).take(t.vertices, t.faces)
 
     @cached_property
     def _forth(self) -> Places:
@@ -184,22 +285,13 @@ class SurfaceMap:
             back: from the target to the source.
 
         Returns:
-            (W, ...) a row for each vertex of the other mesh file (see :func:`by_file_vertex`).
+            (W, ...) a row for each vertex of the other mesh file, interpolated where
+            :meth:`correspondences` says.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
-        start, end = self.source.surface, self.target.surface
-        places = self._back
-        if back:
-            start, end, places = end, start, self._forth
-        inner = on_cut_mesh(start, as_values(values, "values to transfer"))
-        if np.issubdtype(inner.dtype, np.integer) or inner.dtype == bool:
-            best = places.weights.argmax(axis=1)
-            moved = inner[start.faces[places.face, best]]
-        else:
-            moved = places.take(inner, start.faces)
-        return by_file_vertex(end, moved)
+        return transferred(self, values, back)
 
     def bake(
         self,
@@ -226,13 +318,7 @@ class SurfaceMap:
             NsmError: ``missing_uv``, ``missing_texture`` or ``missing_file`` of the mesh that the
                 texture is on; ``wrong_mesh`` for other meshes than the map's; ``out_of_range``.
         """
-        if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= LARGEST_SIZE:
-            message = f"size: {size!r} is not a whole number from 1 to {LARGEST_SIZE}"
-            raise NsmError(message, kind="out_of_range", key="size")
-        ends = [target, source] if back else [source, target]
-        paint = read_texture(ends[0], texture)
-        start, end = (read_file_mesh(one) for one in ends)
-        return painted(self, start, paint, end, back=back, size=size)
+        return painted_by(self, source, target, texture=texture, back=back, size=size)
 
     def matrix(self) -> csr_matrix:
         """The matrix (W, V) that :meth:`transfer` applies to values at the source's vertices.
@@ -240,19 +326,18 @@ class SurfaceMap:
         Rows belong to vertices of the target's mesh file, columns to those of the source's. Rows
         have a sum of one and no negative entries.
         """
-        s, t = self.source.surface, self.target.surface
-        ids = np.arange(len(t.vertices))
-        columns = s.faces[self._back.face]
-        blend = csr_matrix(
-            (self._back.weights.ravel(), (np.repeat(ids, 3), columns.ravel())),
-            shape=(len(ids), len(s.vertices)),
-        )
-        return csr_matrix(blend[by_file_vertex(t, ids)] @ cut_mesh_matrix(s))
+        return correspondence_matrix(self)
+
+    @cached_property
+    def reliability(self) -> Reliability:
+        """Figures at the vertices of the source's file that say where to trust the map."""
+        return reliability(self)
 
     def morph(self, t: float) -> np.ndarray:
-        """Vertices (V, 3) on straight lines from the source (t = 0) to the target (t = 1).
+        """Vertices (W, 3) on straight lines from the source (t = 0) to its image (t = 1).
 
-        In normalised units; a rigid motion first aligns the target with the source.
+        They are those of the source's file, in its units; the image is scaled to the source's area
+        and aligned with it by a rigid motion. :meth:`export_morph` leaves it in its place.
 
         Raises:
             NsmError: ``wrong_type``: t is not a finite number.
@@ -260,7 +345,21 @@ class SurfaceMap:
         if not isinstance(t, Real) or not math.isfinite(t):
             message = f"morph: {t!r} is not a number from 0 to 1"
             raise NsmError(message, kind="wrong_type", key="t")
-        return (1 - t) * self.source.surface.vertices + t * self.aligned_image
+        end = self.source.in_original_units(self.aligned(self.welded_image))
+        return (1 - t) * self.source.file_mesh()[0] + t * end
+
+    def export_morph(self, path: str | Path) -> None:
+        """Write a GLB file: the source's mesh, with its image on the target as morph target.
+
+        Vertices and faces are those of the source's file. Both shapes have the units and place of
+        their own files, in single precision; programs show the target as a shape key.
+
+        Raises:
+            NsmError: ``unknown_format``: the file's ending is not .glb; ``out_of_range``: a length
+                exceeds single precision.
+            OSError: the folder cannot be written.
+        """
+        write_morph(path, self)
 
     @cached_property
     def aligned_image(self) -> np.ndarray:
@@ -297,82 +396,3 @@ class SurfaceMap:
             "config": self.config,
         }
         write_pair(place / STEM, FORMAT, tensors, metadata)
-
-
-def load_surface_map(folder: str | Path, trust: Iterable[str] = ()) -> SurfaceMap:
-    """Read what :meth:`SurfaceMap.save` wrote.
-
-    Args, Raises:
-        as for :func:`nsm.results.load_surface`.
-    """
-    place = Path(folder)
-    tensors, metadata = read_pair(place / STEM, FORMAT)
-    source, target = (load_surface(place / end, trust) for end in ("source", "target"))
-    try:
-        correction = Correction.taken(tensors, len(source.surface.vertices))
-        h = placed_map(metadata["map"], tensors, trust)
-        landmarks = np.array(metadata["landmarks"], dtype=np.int64).reshape(-1, 2)
-        metrics, config = dict(metadata["metrics"]), dict(metadata["config"])
-    except DAMAGE as error:
-        raise damaged(place / STEM, error) from error
-    return SurfaceMap(source, target, h, landmarks, metrics, config, correction)
-
-
-def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
-    """Values at the cut mesh's vertices (V, ...) as values at the mesh file's (W, ...).
-
-    A seam vertex takes the value of its first copy, a merged vertex that of the vertex it was
-    merged with, and a vertex that is not on the surface that of the one with the nearest number.
-    """
-    row = surface.cut_vertex
-    present = np.flatnonzero(row >= 0)
-    nearest = present[np.searchsorted(present, np.arange(len(row))).clip(max=len(present) - 1)]
-    return values[row[nearest]]
-
-
-def on_cut_mesh(surface: Surface, values: np.ndarray) -> np.ndarray:
-    """Values at the mesh file's vertices (W, ...) as values at the cut mesh's (V, ...).
-
-    Vertices that were inserted between others take the mean of their neighbours, or a label of one.
-
-    Raises:
-        NsmError: ``wrong_shape``: not a row for each vertex of the file.
-    """
-    needed = len(surface.cut_vertex)
-    if values.ndim == 0 or len(values) != needed:
-        rows = 0 if values.ndim == 0 else len(values)
-        message = f"{surface.name} has {needed} vertices, but {rows} rows were given"
-        raise NsmError(message, kind="wrong_shape", key=surface.name)
-    result = values[np.maximum(surface.source_vertex, 0)]
-    whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool
-    for vertex, around in _inserted(surface):
-        result[vertex] = result[around[0]] if whole else result[around].mean(axis=0)
-    return result
-
-
-def cut_mesh_matrix(surface: Surface) -> csr_matrix:
-    """What :func:`on_cut_mesh` does to numbers, as a matrix (V, W)."""
-    known = np.flatnonzero(surface.source_vertex >= 0)
-    rows, columns, weights = [known], [surface.source_vertex[known]], [np.ones(len(known))]
-    for vertex, around in _inserted(surface):
-        rows.append(np.full(len(around), vertex))
-        columns.append(surface.source_vertex[around])
-        weights.append(np.full(len(around), 1 / len(around)))
-    entries = (np.concatenate(rows), np.concatenate(columns))
-    shape = (len(surface.vertices), len(surface.cut_vertex))
-    return csr_matrix((np.concatenate(weights), entries), shape=shape)
-
-
-def _inserted(surface: Surface) -> Iterator[tuple[int, np.ndarray]]:
-    """Each vertex that was inserted between others, and its neighbours (N,) of the mesh file."""
-    for vertex in np.flatnonzero(surface.source_vertex < 0).tolist():
-        around = np.unique(surface.faces[(surface.faces == vertex).any(axis=1)])
-        yield vertex, around[surface.source_vertex[around] >= 0]
-
-
-def _located(surface: Surface, points: np.ndarray, what: str) -> Places:
-    """The places on a surface's mesh nearest to points (N, 3) in the units of its file."""
-    points = as_points(points, 3, what)
-    with np.errstate(over="ignore"):  # of points far away
-        normalised = (points - surface.center) * surface.scale
-    return locate(normalised, surface.vertices, surface.faces)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
 from rich.text import Text
 
 from nsm.domains.orbifold.alignment import Alignment
+from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
+from nsm.results.pair_metrics import START
 
 _ROWS = {
     "rms_percent": ("RMS distance", "% of diagonal"),
@@ -30,23 +32,28 @@ def metrics_table(metrics: Mapping[str, float]) -> Table:
 
 
 _MAP_COLUMNS = {
-    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
-    "symmetric_dirichlet_p95": "95th percentile",
+    "symmetric_dirichlet_median": "D_iso, median",
+    "symmetric_dirichlet_p95": "95th per- centile",
+    "conformal_median": "D_conf, median",
     "singular_value_ratio_median": "σ₁/σ₂, median",
-    "area_median": "area, median",
-    "flipped_percent": "flipped %",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "after",
     "boundary_self_intersections": "overlaps",
 }
+# what a method of :class:`nsm.results.Parameterization` is called in the table
+_METHODS = {"domain": "before: domain Ω"}
 
 
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
-    """The figures of :func:`nsm.results.planar_metrics`, a row for each map."""
-    table = Table("map", padding=(0, 1, 0, 0))  # headings fit a terminal of 80 columns
-    table.columns[0].no_wrap = True
-    for heading in _MAP_COLUMNS.values():
-        table.add_column(heading, width=max(map(len, heading.split())))
+    """The figures of :func:`nsm.results.planar_metrics`, a row for each map.
+
+    D_iso is symmetric Dirichlet (METHOD, Eq. 2), D_conf the conformal energy (Eq. 3).
+    """
+    table = _narrow("map", _MAP_COLUMNS.values())
     for name, figures in metrics.items():
-        table.add_row(name, *(f"{figures[key]:.3f}" for key in _MAP_COLUMNS))
+        shown = (_shown(figures, key, "")[0] for key in _MAP_COLUMNS)
+        table.add_row(_METHODS.get(name, name), *shown)
+    table.caption = f"D_iso is {LEAST_SYMMETRIC_DIRICHLET} at best, D_conf 0, σ₁/σ₂ 1"
     return table
 
 
@@ -54,10 +61,14 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
 _TORN = 1.0
 
 _PAIR_ROWS = {
-    "symmetric_dirichlet_median": ("symmetric Dirichlet, median", "4 at best"),
+    "symmetric_dirichlet_median": (
+        "symmetric Dirichlet, median",
+        f"{LEAST_SYMMETRIC_DIRICHLET} at best",
+    ),
     "symmetric_dirichlet_mean": ("symmetric Dirichlet, mean", ""),
     "symmetric_dirichlet_p95": ("symmetric Dirichlet, 95th percentile", ""),
     "singular_value_ratio_median": ("σ₁/σ₂, median", "1 at best"),
+    "flipped_before_repair_percent": ("flipped triangles, before repair", "%"),
     "flipped_percent": ("flipped triangles", "%"),
     "outside_percent": ("vertices outside Ω", "%"),
     "landmark_error_mean_percent": ("landmark error, mean", "% of diagonal"),
@@ -71,7 +82,8 @@ _PAIR_ROWS = {
 
 
 def pair_table(metrics: Mapping[str, float]) -> Table:
-    """The main figures of :func:`nsm.results.pair_metrics` with their names and units."""
+    """The main figures of :func:`nsm.results.pair_metrics` with their names and units, beside those
+    of the map before its optimization, if there are any."""
     return _figures(metrics, _PAIR_ROWS, missing=("landmark_error_max_percent",))
 
 
@@ -104,33 +116,53 @@ def isotopy_table(found: Sequence[Alignment]) -> Table:
 
 
 _COLLECTION_COLUMNS = {
-    "symmetric_dirichlet_median": "symmetric Dirichlet, median",
-    "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_percent": "flipped %",
+    "start_symmetric_dirichlet_median": "median at start",
+    "symmetric_dirichlet_median": "median at end",
+    "symmetric_dirichlet_p95": "95th per- centile",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "after",
     "outside_percent": "outside %",
-    "landmark_error_max_percent": "landmark error, largest %",
+    "landmark_error_max_percent": "marks off, most %",
     "seam_gap_mean_percent": "seam gap, mean %",
 }
 
 
 def collection_table(metrics: Mapping[str, Any]) -> Table:
-    """The figures of :func:`nsm.results.collection_metrics`, a row for each ordered pair."""
+    """The figures of :func:`nsm.results.collection_metrics`, a row for each ordered pair; medians
+    are of symmetric Dirichlet."""
     every = {key for figures in metrics["pairs"].values() for key in figures}
     columns = {key: label for key, label in _COLLECTION_COLUMNS.items() if key in every}
-    table = Table("pair", *columns.values())
-    table.columns[0].no_wrap = True
+    table = _narrow("pair", columns.values())
     for name, figures in metrics["pairs"].items():
         shown = (_shown(figures, key, "")[0] for key in columns)
         table.add_row(name, *shown)
     cycle = [metrics[f"cycle_error_{key}_percent"] for key in ("mean", "max")]
-    table.caption = f"cycle error: mean {cycle[0]:.2g} %, maximum {cycle[1]:.2g} % of the diagonal"
+    table.caption = (
+        f"symmetric Dirichlet, {LEAST_SYMMETRIC_DIRICHLET} at best; cycle error: mean "
+        f"{cycle[0]:.2g} %, maximum {cycle[1]:.2g} % of the diagonal"
+    )
+    return table
+
+
+def _narrow(first: str, headings: Iterable[str]) -> Table:
+    """A table whose headings break between words, to fit a terminal of 80 columns."""
+    table = Table(first, padding=(0, 1, 0, 0))
+    table.columns[0].no_wrap = True
+    for heading in headings:
+        table.add_column(heading, width=max(map(len, heading.split())))
     return table
 
 
 # figure -> label, unit, of all tasks
 FIGURES: dict[str, tuple[str, str]] = {
     **_PAIR_ROWS,
+    **{
+        f"start_{key}": (f"before optimization: {label}", unit)
+        for key, (label, unit) in _PAIR_ROWS.items()
+        if key in START
+    },
     **_ROWS,
+    "conformal_median": ("D_conf, median", "0 at best"),
     "area_median": ("area, median", "0 at best"),
     "boundary_self_intersections": ("overlaps of the boundary", ""),
     "cycle_error_mean_percent": ("cycle error, mean", "% of diagonal"),
@@ -147,11 +179,15 @@ def _figures(
     missing: Sequence[str] = (),
 ) -> Table:
     """The rows that there are figures for; of the ``missing`` ones, a dash instead."""
-    table = Table("figure", "value", "unit")
-    table.columns[1].justify = "right"
+    before = any(f"start_{key}" in metrics for key in rows)
+    table = Table("figure", *(["at the start"] if before else []), "value", "unit")
+    for column in table.columns[1:-1]:
+        column.justify = "right"
     for key, (label, unit) in rows.items():
         if key in metrics or key in missing:  # a closed domain has no seam to report
-            table.add_row(label, *_shown(metrics, key, unit))
+            start = metrics.get(f"start_{key}")
+            first = ["" if start is None else f"{start:.3f}"] if before else []
+            table.add_row(label, *first, *_shown(metrics, key, unit))
     return table
 
 

@@ -19,7 +19,7 @@ from nsm.surfaces.atlas import unwrapped
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.loading import is_mesh_path, load_mesh
 from nsm.surfaces.location import Places
-from nsm.surfaces.textures import Texture, read_uv
+from nsm.surfaces.textures import Texture, read_texture, read_uv
 
 if TYPE_CHECKING:
     from nsm.results.surface_map import SurfaceMap
@@ -131,6 +131,25 @@ class TexturedMesh:
         data = trimesh.Scene(mesh).export(file_type="glb")
         assert isinstance(data, bytes)
         atomic_write(target, data)
+
+
+def painted_by(
+    f: SurfaceMap,
+    source: str | Path,
+    target: str | Path,
+    *,
+    texture: str | Path | None,
+    back: bool,
+    size: int,
+) -> TexturedMesh:
+    """The texture of one mesh file on the other, as :meth:`SurfaceMap.bake` describes it."""
+    if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= LARGEST_SIZE:
+        message = f"size: {size!r} is not a whole number from 1 to {LARGEST_SIZE}"
+        raise NsmError(message, kind="out_of_range", key="size")
+    ends = [target, source] if back else [source, target]
+    paint = read_texture(ends[0], texture)
+    start, end = (read_file_mesh(one) for one in ends)
+    return painted(f, start, paint, end, back=back, size=size)
 
 
 def painted(

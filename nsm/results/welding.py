@@ -60,7 +60,7 @@ def weld(
         places: (V,) where the map sends the source's vertices, on the target's faces.
         kept: vertices of the source, such as landmarks, whose other copies go to their image.
     """
-    corners, rejoined = chords_joined(source.faces, source.source_vertex < 0)
+    corners, rejoined, _ = chords_joined(source.faces, source.source_vertex == -1)
     faces = source.source_vertex[corners]
     ids, first, number, count = np.unique(
         source.source_vertex, return_index=True, return_inverse=True, return_counts=True
@@ -85,7 +85,9 @@ def weld(
     points = np.where(single[:, None], before, image.points[number])
     moves = np.linalg.norm(points - before, axis=1)
     flips = int((image.heights(compact) <= 0).sum())
-    return Weld(Places(face, weights), points, corners, faces, flips, float(moves.max(initial=0.0)))
+    own = (faces >= 0).all(axis=1)  # not over filled holes
+    largest = float(moves.max(initial=0.0))
+    return Weld(Places(face, weights), points, corners[own], faces[own], flips, largest)
 
 
 class _Image:

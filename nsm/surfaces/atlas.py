@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from nsm.surfaces.loading import error_in
@@ -52,3 +54,51 @@ def unwrapped(
     # the width and height differ a little; one scale for both keeps angles
     scale = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
     return (uv.astype(np.float64) * scale)[index.astype(np.int64).reshape(-1, 3)]
+
+
+def packed(
+    charts: Sequence[tuple[np.ndarray, np.ndarray]], *, size: int = 1024
+) -> tuple[list[np.ndarray], float]:
+    """Flat charts side by side in the unit square, moved and all in one scale (xatlas).
+
+    Args:
+        charts: points (V, 2) and counter-clockwise faces (F, 3) of each, without overlaps.
+        size: of the texture in texels, in which charts are kept :data:`PADDING` apart.
+
+    Returns:
+        The points (V, 2) of each, and the scale: length in the square over that in the charts.
+    """
+    import xatlas
+
+    first = np.cumsum([0, *(len(uv) for uv, _ in charts)])
+    points = np.concatenate([uv for uv, _ in charts])
+    faces = np.concatenate([f + n for (_, f), n in zip(charts, first, strict=False)])
+    extent = float(np.ptp(points, axis=0).max())
+    atlas = xatlas.Atlas()
+    atlas.add_uv_mesh((points / extent).astype(np.float32), faces.astype(np.uint32))
+    packing = xatlas.PackOptions()
+    packing.padding, packing.resolution, packing.bilinear = PADDING, size, True
+    # xatlas turns charts by mirroring them
+    packing.rotate_charts = packing.rotate_charts_to_axis = False
+    atlas.generate(pack_options=packing)
+    _, index, uv = atlas[0]
+    side = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
+    corners = (uv.astype(np.float64) * side)[index.astype(np.int64).reshape(-1)]
+    # single precision places charts; each is then moved as a whole
+    flat = faces.reshape(-1)
+    found = []
+    for k, (own, _) in enumerate(charts):
+        mine = (flat >= first[k]) & (flat < first[k + 1])
+        found.append((own[flat[mine] - first[k]], corners[mine]))
+    scale = float(np.mean([_spread(there) / _spread(here) for here, there in found]))
+    placed = [
+        scale * (own - here.mean(axis=0)) + there.mean(axis=0)
+        for (own, _), (here, there) in zip(charts, found, strict=True)
+    ]
+    low = np.min([own.min(axis=0) for own in placed], axis=0)
+    extent = float((np.max([own.max(axis=0) for own in placed], axis=0) - low).max())
+    return [(own - low) / extent for own in placed], scale / extent
+
+
+def _spread(points: np.ndarray) -> float:
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()))

@@ -150,7 +150,7 @@ def cut_to_disc(
         if not graph.loops and genus == 0 and len(terminals) < 2:
             reason = "the surface is closed; give at least two different seam vertices"
             raise _seam_error(name, "too_few", reason)
-    elif genus == 0 and _almost_closed(vertices, faces, graph.loops):
+    elif genus == 0 and almost_closed(vertices, faces, graph.loops):
         farthest = _farthest_points(graph, terminals, FARTHEST_POINTS)
         terminals += [v for v in farthest if v not in terminals]
         log.append(f"seam through {len(farthest)} farthest points")
@@ -160,7 +160,7 @@ def cut_to_disc(
         log.append(
             f"cut along {len(seam)} edges (genus {genus}, {len(graph.loops)} boundary loops)"
         )
-    return _cut_open(vertices, faces, seam, log, name)
+    return cut_open(vertices, faces, seam, log, name)
 
 
 def cut_along_paths(
@@ -176,13 +176,24 @@ def cut_along_paths(
     steps = [np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1) for path in paths]
     low, high = np.concatenate(steps).astype(np.int64).T
     seam = np.searchsorted(keys, low * len(vertices) + high).tolist()
-    log = [f"cut along {len(seam)} edges between {len(paths) + 1} landmarks"]
-    return _cut_open(vertices, faces, seam, log, name)
+    log = [f"cut along {len(seam)} edges in {len(paths)} paths"]
+    return cut_open(vertices, faces, seam, log, name)
 
 
-def _cut_open(
+def cut_open(
     vertices: np.ndarray, faces: np.ndarray, seam: list[int], log: list[str], name: str
 ) -> Cut:
+    """A mesh cut along the edges of a seam, which leaves a disc, with its chords split.
+
+    Args:
+        vertices, faces: the mesh (V, 3), (F, 3).
+        seam: numbers of the edges of :func:`nsm.surfaces.topology.edges_of`.
+        log: lines that say how it was found.
+        name: of the mesh, for messages.
+
+    Raises:
+        NsmError: ``not_a_disc``.
+    """
     is_cut = np.zeros(len(topology.edges_of(faces).pairs), dtype=bool)
     is_cut[seam] = True
     cut_faces, origin = topology.cut_along(faces, is_cut)
@@ -191,7 +202,7 @@ def _cut_open(
         found = f"Euler characteristic {euler}, {len(loops)} boundary loops"
         reason = f"the seam does not leave a disc ({found}); give other {_SEAM_KEY}"
         raise _seam_error(name, "not_a_disc", reason)
-    points, cut_faces, inserted = _split_chords(vertices[origin], cut_faces)
+    points, cut_faces, inserted = split_chords(vertices[origin], cut_faces)
     if inserted:
         log = [*log, f"{inserted} interior edges between boundary vertices split"]
     origin = np.concatenate([origin, np.full(inserted, -1)])
@@ -199,7 +210,8 @@ def _cut_open(
     return Cut(points, cut_faces, origin, seam_pairs(origin), loop, tuple(log))
 
 
-def _almost_closed(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> bool:
+def almost_closed(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> bool:
+    """Whether all boundary loops of a mesh (V, 3), (F, 3) are small, or there are none."""
     sides = [vertices[loop] - vertices[np.roll(loop, -1)] for loop in loops]
     longest = max((float(np.linalg.norm(side, axis=1).sum()) for side in sides), default=0.0)
     return longest < SMALL_BOUNDARY * float(np.sqrt(topology.face_areas(vertices, faces).sum()))
@@ -289,7 +301,7 @@ def _handle_loops(
     return result
 
 
-def _split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+def split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Split each interior edge between two boundary vertices at its midpoint.
 
     On a side of the square the triangles at such an edge would be degenerate, and on a circle
@@ -328,7 +340,7 @@ def _split_chords(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     return points, np.concatenate([faces[~touched], np.array(new, dtype=np.int64)]), inserted
 
 
-# The pieces that _split_chords makes of a face, by the inserted ones among the first one's corners,
+# The pieces that split_chords makes of a face, by the inserted ones among the first one's corners,
 # and where in the pieces (row, corner) the face's own corners are.
 _PIECES = {
     (False, True, False): (2, ((0, 0), (1, 1), (0, 2))),
@@ -337,7 +349,9 @@ _PIECES = {
 }
 
 
-def chords_joined(faces: np.ndarray, inserted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def chords_joined(
+    faces: np.ndarray, inserted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The faces of a disc before its chords were split.
 
     Args:
@@ -345,18 +359,24 @@ def chords_joined(faces: np.ndarray, inserted: np.ndarray) -> tuple[np.ndarray, 
         inserted: (W,) mask of the vertices that it inserted.
 
     Returns:
-        Faces (F, 3), and a mask (F,) of those that were in pieces.
+        Faces (F, 3), a mask (F,) of those that were in pieces, and for each given face (G,) which
+        of these it is, or is a piece of.
     """
     is_piece = inserted[faces].any(axis=1)
-    pieces, joined, at = faces[is_piece], [], 0
+    pieces, joined, counts, at = faces[is_piece], [], [], 0
     while at < len(pieces):
         first, second, third = inserted[pieces[at]].tolist()
         count, own = _PIECES[first, second, third]
         joined.append([int(pieces[at + row, corner]) for row, corner in own])
+        counts.append(count)
         at += count
     whole = faces[~is_piece]
     in_pieces = np.arange(len(whole) + len(joined)) >= len(whole)
-    return np.concatenate([whole, np.array(joined, dtype=np.int64).reshape(-1, 3)]), in_pieces
+    number = np.empty(len(faces), dtype=np.int64)
+    number[~is_piece] = np.arange(len(whole))
+    number[is_piece] = len(whole) + np.repeat(np.arange(len(joined)), counts)
+    every = np.concatenate([whole, np.array(joined, dtype=np.int64).reshape(-1, 3)])
+    return every, in_pieces, number
 
 
 def seam_pairs(origin: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ def read_marks(path: str | Path) -> Marks:
     name or not; numbers after it are ignored. ``.bary``: triangle, three barycentric coordinates,
     and a name or not, on each line. ``.pp``: picked points of MeshLab. ``.json``: a list of
     vertices, of points [x, y, z], or of places [triangle, b0, b1, b2]; or such a landmark for each
-    name.
+    name. A landmark that the surface lacks is vertex -1, or null in JSON.
 
     Raises:
         NsmError: ``no_landmarks``, ``damaged_file``, ``wrong_type``, or as
@@ -191,7 +191,7 @@ def _picked_points(file: Path) -> Marks:
     parser.StartElementHandler = start
     parser.EntityDeclHandler = entity
     try:
-        parser.Parse(_text(file), True)
+        parser.Parse(text(file), True)
     except expat.ExpatError as error:
         raise fault(f"not readable as XML ({expat.ErrorString(error.code)})") from error
     return Marks(np.array(points).reshape(-1, 3), _names(names))
@@ -212,11 +212,12 @@ _READERS: dict[str, Callable[[Path], Marks]] = {
     ".pp": _picked_points,
     ".json": _json_marks,
 }
+ENDINGS = tuple(_READERS)
 
 
 def _lines(file: Path) -> list[tuple[int, list[str]]]:
     """Numbers of the lines that say something, and their fields; # starts a comment."""
-    lines = enumerate(_text(file).splitlines(), start=1)
+    lines = enumerate(text(file).splitlines(), start=1)
     split = [(number, line.partition("#")[0].split()) for number, line in lines]
     return [(number, fields) for number, fields in split if fields]
 
@@ -236,13 +237,19 @@ def _is_number(word: str) -> bool:
 
 def _json(file: Path) -> Any:
     try:
-        return json.loads(_text(file))
+        return json.loads(text(file))
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:80]
         raise error_in(file, "damaged_file", f"not readable as JSON ({reason})") from error
 
 
-def _text(file: Path) -> str:
+def text(file: Path) -> str:
+    """The text of a file of landmarks.
+
+    Raises:
+        NsmError: ``damaged_file``, ``unreadable_file``, or as
+            :func:`nsm.surfaces.loading.check_file`.
+    """
     check_file(file, _LARGEST)
     try:
         return file.read_text(encoding="utf-8")

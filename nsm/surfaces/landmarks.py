@@ -1,7 +1,8 @@
 """Landmarks: corresponding points of surfaces, as vertices of the meshes.
 
 A landmark is a vertex number, a point [x, y, z], or a place [triangle, b0, b1, b2] with barycentric
-coordinates. Maps take landmarks at vertices: of the other two, the nearest vertex.
+coordinates. Maps take landmarks at vertices: of a point the nearest one; a place becomes a vertex
+where a mesh is prepared for the map, and is the nearest one elsewhere.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from scipy.spatial import cKDTree
 from nsm.surfaces.loading import error_in
 from nsm.surfaces.location import Places
 
-Landmarks = list[int] | np.ndarray  # vertices; or points (L, 3); or places (L, 4)
+# vertices, MISSING for none; or points (L, 3) or places (L, 4), rows of NaN for none
+Landmarks = list[int] | np.ndarray
+MISSING = -1
 _SUM = 1e-3  # how far from one barycentric coordinates may add up, and below zero lie
 _FAR = 0.05  # of the bounding box's diagonal: a point farther from the mesh is a mistake
 
 
 class AtVertices(NamedTuple):
-    """Landmarks moved to vertices (L,), and how far each was moved (L,), in the mesh's unit."""
+    """Landmarks moved to vertices (L,), and how far each was moved (L,), in the mesh's unit; a
+    landmark that the mesh lacks is :data:`MISSING`."""
 
     vertex: np.ndarray
     moved: np.ndarray
@@ -37,7 +41,8 @@ def as_vertices(
 
     Args:
         landmarks: vertex numbers; or points (L, 3), each of which becomes the nearest vertex; or
-            places (L, 4), each of which becomes the nearest corner of its triangle.
+            places (L, 4), each of which becomes the nearest corner of its triangle; None or -1
+            among them for landmarks that the mesh lacks.
         vertices: (V, 3), in the unit of the points.
         faces: (F, 3), in the order of the mesh file; None if that is not known.
         name: of the surface, the key of errors.
@@ -47,50 +52,92 @@ def as_vertices(
             its triangle), ``duplicate_landmark`` or ``wrong_type``.
     """
     given = listed(landmarks, name)
+    there = present(given)
     if not isinstance(given, np.ndarray):
-        for k, vertex in enumerate(given):
-            if not 0 <= vertex < len(vertices):
-                reason = f"landmark {k} is vertex {vertex}; give vertices 0 to {len(vertices) - 1}"
+        for k in np.flatnonzero(there).tolist():
+            if not 0 <= given[k] < len(vertices):
+                reason = (
+                    f"landmark {k} is vertex {given[k]}; give vertices 0 to {len(vertices) - 1}"
+                )
                 raise error_in(name, "out_of_range", reason)
         found = AtVertices(np.array(given, dtype=np.int64), np.zeros(len(given)))
-    elif given.shape[1] == 3:
-        distance, nearest = cKDTree(vertices).query(given)
-        limit = _FAR * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-        for k in np.flatnonzero(distance > limit)[:1].tolist():
-            where = f"landmark {k} at {given[k].tolist()} is {distance[k]:.3g} away from the mesh"
-            reason = f"{where}; give points on the mesh, in the units of its file"
-            raise error_in(name, "not_on_surface", reason)
-        found = AtVertices(nearest.astype(np.int64), distance)
     else:
-        found = _nearest_corners(given, vertices, faces, name)
+        numbers = np.flatnonzero(there)
+        nearest = _nearest_vertices if given.shape[1] == 3 else _nearest_corners
+        some = nearest(given[there], numbers, vertices, faces, name)
+        found = AtVertices(np.full(len(given), MISSING), np.zeros(len(given)))
+        found.vertex[there], found.moved[there] = some
     seen: dict[int, int] = {}
     for k, vertex in enumerate(found.vertex.tolist()):
-        if vertex in seen:
+        if vertex in seen and vertex != MISSING:
             reason = f"landmarks {seen[vertex]} and {k} are both vertex {vertex}; leave one out"
             raise error_in(name, "duplicate_landmark", reason)
         seen[vertex] = k
     return found
 
 
+def present(landmarks: Landmarks) -> np.ndarray:
+    """Mask (L,) of the landmarks that a surface has."""
+    if isinstance(landmarks, np.ndarray) and landmarks.ndim == 2:
+        return np.asarray(np.isfinite(landmarks).all(axis=1))
+    return np.asarray(landmarks, dtype=np.int64) != MISSING
+
+
+def _nearest_vertices(
+    given: np.ndarray,
+    numbers: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray | None,
+    name: str,
+) -> AtVertices:
+    distance, nearest = cKDTree(vertices).query(given)
+    limit = _FAR * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    for k in np.flatnonzero(distance > limit)[:1].tolist():
+        what = f"landmark {numbers[k]} at {given[k].tolist()}"
+        where = f"{what} is {distance[k]:.3g} away from the mesh"
+        reason = f"{where}; give points on the mesh, in the units of its file"
+        raise error_in(name, "not_on_surface", reason)
+    return AtVertices(nearest.astype(np.int64), distance)
+
+
 def _nearest_corners(
-    given: np.ndarray, vertices: np.ndarray, faces: np.ndarray | None, name: str
+    given: np.ndarray,
+    numbers: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray | None,
+    name: str,
 ) -> AtVertices:
     if faces is None:
         reason = "the triangles of its file are not known here; give vertices, or the mesh file"
         raise error_in(name, "wrong_type", reason)
-    for k, (face, *weights) in enumerate(given.tolist()):
-        if not 0 <= face < len(faces) or not face.is_integer():
-            reason = f"landmark {k} is in triangle {face:g}; give triangles 0 to {len(faces) - 1}"
-            raise error_in(name, "out_of_range", reason)
-        if abs(sum(weights) - 1) > _SUM or min(weights) < -_SUM:
-            reason = f"landmark {k} has the coordinates {weights}; they are positive, with sum 1"
-            raise error_in(name, "not_on_surface", reason)
+    check_places(given, faces, name, numbers)
     at = Places(given[:, 0].astype(np.int64), given[:, 1:]).take(vertices, faces)
     corners = faces[given[:, 0].astype(np.int64)]
     distance = np.linalg.norm(vertices[corners] - at[:, None], axis=2)
     nearest = distance.argmin(axis=1)
     rows = np.arange(len(given))
     return AtVertices(corners[rows, nearest].astype(np.int64), distance[rows, nearest])
+
+
+def check_places(given: np.ndarray, faces: np.ndarray, name: str, numbers: np.ndarray) -> None:
+    """Check that places (L, 4) are on triangles (F, 3).
+
+    Args:
+        given: the places.
+        faces: of the mesh.
+        name: of the surface, the key of errors.
+        numbers: (L,) which landmark each is.
+
+    Raises:
+        NsmError: ``out_of_range``: no such triangle; ``not_on_surface``: outside its triangle.
+    """
+    for k, (face, *weights) in zip(numbers.tolist(), given.tolist(), strict=True):
+        if not 0 <= face < len(faces) or not face.is_integer():
+            reason = f"landmark {k} is in triangle {face:g}; give triangles 0 to {len(faces) - 1}"
+            raise error_in(name, "out_of_range", reason)
+        if abs(sum(weights) - 1) > _SUM or min(weights) < -_SUM:
+            reason = f"landmark {k} has the coordinates {weights}; they are positive, with sum 1"
+            raise error_in(name, "not_on_surface", reason)
 
 
 def numbered(given: Landmarks, numbers: np.ndarray, name: str) -> Landmarks:
@@ -110,6 +157,7 @@ def numbered(given: Landmarks, numbers: np.ndarray, name: str) -> Landmarks:
             raise error_in(name, "wrong_type", "give vertices or points, not places in triangles")
         return given
     local = {vertex: k for k, vertex in enumerate(numbers.tolist())}
+    local[MISSING] = MISSING
     for k, vertex in enumerate(given):
         if vertex not in local:
             raise error_in(name, "not_on_surface", f"landmark {k}, vertex {vertex}, is not on it")
@@ -142,7 +190,8 @@ def listed(given: Any, what: str) -> Landmarks:
     """Landmarks as a list of vertex numbers, or as points (L, 3), or as places (L, 4).
 
     Args:
-        given: a list, array or tensor.
+        given: a list, array or tensor; None, -1 or a row of NaN in it for a landmark that the
+            surface lacks.
         what: what it is, the key of errors.
 
     Raises:
@@ -151,20 +200,34 @@ def listed(given: Any, what: str) -> Landmarks:
     given = as_lists(given)
     if not isinstance(given, list):
         raise error_in(what, "wrong_type", "give a list of landmarks")
-    if all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in given):
+    if all(x is None or _is_number(x) for x in given):
         for k, x in enumerate(given):
-            if not float(x).is_integer():  # np.loadtxt returns integers as floats
+            # np.loadtxt returns integers as floats
+            if x is not None and not float(x).is_integer():
                 reason = f"landmark {k} is {x}; vertex numbers are whole, points [x, y, z]"
                 raise error_in(what, "wrong_type", reason)
-        return [int(x) for x in given]
+        return [MISSING if x is None else int(x) for x in given]
+    there = [not _is_missing(x) for x in given]
     try:
-        points = np.array(given, dtype=np.float64)
+        some = np.array([x for x, has in zip(given, there, strict=True) if has], dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        points = np.zeros(0)
-    if points.ndim != 2 or points.shape[1] not in (3, 4) or not np.isfinite(points).all():
+        some = np.zeros(0)
+    if some.ndim != 2 or some.shape[1] not in (3, 4) or not np.isfinite(some).all():
         reason = (
             "give landmarks all as vertex numbers, all as points [x, y, z], or all as places "
             "[triangle, b0, b1, b2]"
         )
         raise error_in(what, "wrong_type", reason)
+    points = np.full((len(given), some.shape[1]), np.nan)
+    points[there] = some
     return points
+
+
+def _is_missing(x: Any) -> bool:
+    if isinstance(x, list):
+        return len(x) > 0 and all(_is_number(c) and c != c for c in x)
+    return x is None or (_is_number(x) and x == MISSING)
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, (int, float)) and not isinstance(x, bool)

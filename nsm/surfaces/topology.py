@@ -152,3 +152,17 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Areas (F,) of the triangles of a 3D mesh, in the square of its unit."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def equal_faces(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of (G, 3) and of (F, 3) with the same three numbers, none negative: pairs (M,), (M,)."""
+    rows = np.sort(np.concatenate([there, here]), axis=1)
+    _, number = np.unique(rows, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    usable = np.asarray((rows >= 0).all(axis=1))
+    first = np.full(number.max() + 1, -1)
+    mine = np.flatnonzero(usable[: len(there)])[::-1]  # the first of equal faces is taken
+    first[number[mine]] = mine
+    match = np.where(usable[len(there) :], first[number[len(there) :]], -1)
+    found = np.flatnonzero(match >= 0)
+    return match[found], found

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from nsm.surfaces import topology
+from nsm.surfaces import holes, topology
 from nsm.surfaces.cutting import first_copies
+from nsm.surfaces.holes import fill
 from nsm.surfaces.loading import as_arrays, check_arrays, error_in
 
 # Connected components below these shares of the area (each, and all together) are debris or
@@ -41,10 +42,12 @@ class Repairs:
         parts: which connected component is kept: the largest, or that of a number, counted from 0
             by falling area; None: small ones are removed, and others refused.
         repair: split: the mesh is cut apart at non-manifold edges; None: they are refused.
+        fill_holes: the largest number of edges of holes to fill; true: small ones; false: none.
     """
 
     parts: Literal["largest"] | int | None = None
     repair: Literal["split"] | None = None
+    fill_holes: bool | int = False
 
 
 NO_DECISION = Repairs()
@@ -57,7 +60,8 @@ class CleanMesh:
     Attributes:
         vertices: (V, 3).
         faces: (F, 3).
-        source_vertex: (V,) the index of each vertex in the given mesh.
+        source_vertex: (V,) the index of each vertex in the given mesh; -2, -3, ... for those in
+            the middle of filled holes.
         merged: (W,) for each given vertex its index here, or -1 if it was removed.
         log: one line per repair.
     """
@@ -114,7 +118,10 @@ def clean(
         split_faces = np.searchsorted(kept, split_faces)
         old = old[kept]
     merged = first_copies(old, len(vertices))[representative]
-    return CleanMesh(vertices[old], split_faces, old, merged, tuple(log))
+    points, split_faces, filled = fill(vertices[old], split_faces, repairs.fill_holes)
+    middles = holes.FIRST - np.arange(len(points) - len(old))
+    source = np.concatenate([old, middles])
+    return CleanMesh(points, split_faces, source, merged, (*log, *filled))
 
 
 def _check_size(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import LatticeAligned, Rotated, batched
+from nsm.settings import CollectionConstraints
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
@@ -31,7 +32,8 @@ class CollectionMap(ConstrainedMap):
     i. The loss is METHOD's sum over all ordered pairs, divided by k(k − 1): each surface takes
     part in 2(k − 1) pairs, so its energy and its constraints have the same proportion for all k,
     and the loss does not grow with k. Four is the number of surfaces for which the default weights
-    were measured. Multipliers are scaled like the term C.
+    were measured. Multipliers are scaled like the term C. With ``constraints.pairs=sum`` the loss
+    is METHOD's: the sum over all ordered pairs, and Σ_i of the other terms without the 4/k.
 
     Args:
         map, activation, encoding: settings of each h_i's network.
@@ -39,17 +41,21 @@ class CollectionMap(ConstrainedMap):
         max_steps, domain, energy, loss_weights, constraints, loss_terms: see
             :class:`nsm.tasks.constrained.ConstrainedMap`.
         points: (K, 2) landmarks in the common domain.
-        targets: (k, K, 2) the same in each surface's own.
+        targets: (k, K, 2) the same in each surface's own; NaN where a surface lacks the landmark.
         seam: (T, 2, 2) pairs of points of the common ∂Ω that are one point of each surface.
         starts: where each h_i starts, a rotation or, on a closed domain, an affine map: maps around
             the identity.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
+        names: of the surfaces, each its own, for the curves ``pairs/A_to_B``; None: their numbers.
 
     Raises:
         ValueError: a constraint that is not known.
     """
+
+    Constraints = CollectionConstraints
+    constraints: CollectionConstraints
 
     def __init__(
         self,
@@ -71,9 +77,10 @@ class CollectionMap(ConstrainedMap):
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh"]
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh", "names"]
         self.save_hyperparameters(ignore=given, logger=False)
         onto = domain if self.exact else None
         self.map = nn.ModuleList(
@@ -89,6 +96,9 @@ class CollectionMap(ConstrainedMap):
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
+        names = names or [str(k) for k in range(len(phis))]
+        both = zip(*(part.tolist() for part in self.ordered), strict=True)
+        self.pair_names = [f"pairs/{names[a]}_to_{names[b]}" for a, b in both]
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (N, 2) of the common domain to those of all surfaces, (k, N, 2)."""
@@ -97,7 +107,8 @@ class CollectionMap(ConstrainedMap):
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         self.batch = batch
-        w, ramp, scale = self.loss_weights, self.ramp, _SURFACES / len(self.map)
+        w, ramp = self.loss_weights, self.ramp
+        pairs, scale = self._scales()
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
@@ -107,7 +118,7 @@ class CollectionMap(ConstrainedMap):
         U = self._triangle_term() if w.triangles > 0 else 0.0
         C, multipliers = self.landmark_terms()
 
-        loss = energy + scale * (
+        loss = pairs * energy + scale * (
             multipliers
             + w.injectivity * G
             + w.boundary * B
@@ -116,7 +127,7 @@ class CollectionMap(ConstrainedMap):
             + self.landmark_weight * C
         )
         terms: dict[str, Term] = {
-            **distortion.terms,
+            **{name: (pairs * weight, E) for name, (weight, E) in distortion.terms.items()},
             "multipliers": (scale, multipliers),
             "injectivity": (scale * w.injectivity, G),
             "boundary": (scale * w.boundary, B),
@@ -142,6 +153,12 @@ class CollectionMap(ConstrainedMap):
         evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
         return Distortion(self.energy, parts, share[i]), evaluation
 
+    def _scales(self) -> tuple[int, float]:
+        """The weights of the mean over the pairs, and of the sums over the surfaces."""
+        k = len(self.map)
+        summed = self.constraints.pairs == "sum"
+        return (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
+
     def _shares(self, forms: Tensor, images: Tensor) -> Tensor:
         """How much each sample counts for each source, (k, N).
 
@@ -155,13 +172,13 @@ class CollectionMap(ConstrainedMap):
 
     def curvatures(self) -> list[Curvature]:
         x, w, k = self.batch, self.loss_weights, len(self.map)
-        scale = _SURFACES / k
+        pairs, scale = self._scales()
         with torch.no_grad():
             images, inner = batched(list(self.map)).value_and_jacobian(x.expand(k, -1, -1))
             positions, outer = batched(list(self.phis)).value_and_jacobian(images)
             forms = first_fundamental_form(outer @ inner)
             share = self._shares(forms, images).double()
-            share /= share.sum(dim=1, keepdim=True).clamp(min=1e-12) * k * (k - 1)
+            share *= pairs / (share.sum(dim=1, keepdim=True).clamp(min=1e-12) * k * (k - 1))
 
         def energy(i: int, j: Tensor) -> Tensor:
             """The part of the loss at each sample that the map of surface i has."""
@@ -179,7 +196,7 @@ class CollectionMap(ConstrainedMap):
         for i, h in enumerate(self.map):
             found.append(Curvature(h, x, positive_hessians(partial(energy, i), inner[i])))
             if len(self.points):
-                each = of_landmarks.expand(len(self.points), 2, 2)
+                each = self.there[i].to(x)[:, None, None] * of_landmarks
                 found.append(Curvature(h, self.points, each))
         return found
 
@@ -211,7 +228,10 @@ class CollectionMap(ConstrainedMap):
         return torch.stack([barrier(h, self.global_step) for h, barrier in both]).sum()
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
-        self.log_validation(*self._evaluated(batch))
+        distortion, evaluation = self._evaluated(batch)
+        self.log_validation(distortion, evaluation)
+        of_pairs = dict(zip(self.pair_names, distortion.means.unbind(), strict=True))
+        self.log_figures(of_pairs, batch_size=len(batch))
 
     def flipped_percent(self) -> Tensor:
         both = zip(self.map, self.fold_barrier, strict=True)
@@ -220,4 +240,5 @@ class CollectionMap(ConstrainedMap):
     def landmark_error(self) -> Tensor:
         phis = batched(list(self.phis))
         units = self.targets.new_tensor(self.diagonals)[:, None]
-        return 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
+        every = 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
+        return every[self.there]

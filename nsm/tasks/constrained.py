@@ -52,6 +52,7 @@ class ConstrainedMap(Training):
     points: Tensor
     targets: Tensor
     start: Tensor
+    there: Tensor
     seam: Tensor
     boundary_samples: Tensor
     multipliers: Tensor
@@ -68,7 +69,7 @@ class ConstrainedMap(Training):
         super().__init__()
         self.domain, self.energy = domain, as_blend(energy)
         self.loss_weights = PairWeights(**loss_weights)
-        self.constraints = PairConstraints(**constraints)
+        self.constraints = self.Constraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
         self.folds = Folds(self.constraints.injectivity)
         self.held_out = HeldOut()
@@ -81,11 +82,12 @@ class ConstrainedMap(Training):
         """Register landmarks: points (K, 2), their targets and where h has them at its start
         (..., K, 2), and pairs of points of ∂Ω (T, 2, 2) whose images should be one point.
 
-        On a closed domain, the targets' lifts nearest to the start are wanted.
+        A target is NaN where a surface lacks the landmark. On a closed domain, the targets are the
+        lifts that h should meet.
         """
-        lifted = self.domain.lift(targets.flatten(0, -2), start.flatten(0, -2))
-        targets = lifted.view_as(targets)
-        given = {"points": points, "targets": targets, "start": start, "seam": seam}
+        there = torch.isfinite(targets).all(dim=-1)
+        targets = torch.where(there[..., None], targets, start)
+        given = {"points": points, "targets": targets, "start": start, "seam": seam, "there": there}
         if not self.exact:
             given["boundary_samples"] = self.domain.boundary_samples()
         for name, tensor in given.items():
@@ -105,7 +107,7 @@ class ConstrainedMap(Training):
 
     def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
         """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target, which may
-        move on the ramp; 0.0 where there are none."""
+        move on the ramp, over the landmarks that there are; 0.0 where there are none."""
         if not len(self.points):
             return 0.0, 0.0
         moved = self(self.points)
@@ -113,7 +115,7 @@ class ConstrainedMap(Training):
         if self.constraints.ramp_of == "targets":
             wanted = self.start + self.ramp * (self.targets - self.start)
         multipliers: Tensor | float = 0.0
-        C = landmark(moved, wanted).sum()
+        C = (self.there * landmark(moved, wanted)).sum()
         if self.constraints.landmarks == "augmented":
             multipliers = (self.multipliers * (moved - wanted)).sum()
         return C, multipliers
@@ -127,7 +129,7 @@ class ConstrainedMap(Training):
         if self.global_step % held.multiplier_every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
-                self.multipliers += 2 * self.loss_weights.landmarks * off
+                self.multipliers += 2 * self.loss_weights.landmarks * off * self.there[..., None]
 
     def strengthen(self, steps: int) -> None:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of

@@ -3,6 +3,9 @@ domain, an affine map of the lattice."""
 
 from __future__ import annotations
 
+import copy
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -10,13 +13,26 @@ from nsm.domains import Domain
 from nsm.domains import domain as domain_of
 from nsm.domains.orbifold.alignment import Alignment
 from nsm.energies import first_fundamental_form, rotation, symmetric_dirichlet
-from nsm.maps import LatticeAligned
+from nsm.maps import LatticeAligned, Rotated
 
 
 def aligned(found: Alignment) -> LatticeAligned:
     """The start x ↦ Bx + c of an alignment, around the identity."""
     matrix, shift = (torch.as_tensor(x, dtype=torch.float32) for x in (found.matrix, found.shift))
     return LatticeAligned(nn.Identity(), matrix, shift)
+
+
+def carried(
+    points: np.ndarray,
+    through: Rotated | LatticeAligned,
+    back_by: Rotated | LatticeAligned | None = None,
+) -> np.ndarray:
+    """Points (N, 2) by a start, after the inverse of another one: what a map is before it is
+    trained."""
+    x = torch.as_tensor(points, dtype=torch.float64)
+    if back_by is not None:
+        x = copy.deepcopy(back_by).double().back(x)
+    return copy.deepcopy(through).double().before(x).numpy()
 
 
 def landmark_rotation(domain: str | Domain, points: Tensor, targets: Tensor) -> Tensor:

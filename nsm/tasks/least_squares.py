@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kron
+from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kron, triu
 from torch import Tensor, nn
 
 from nsm.data import SurfaceSampler
@@ -28,7 +28,7 @@ from nsm.tasks.multigrid import folding, lattice_refinements, solve, solve_throu
 # samples for each grid point or feature
 _SAMPLES = 4
 _FEWEST = 20_000
-_AT_ONCE = 65_536
+_AT_ONCE = 16_384
 # of the samples, one of so many is on the boundary, so that both sides of a seam meet: measured on
 # bunny, shrec07-384, cow and igea, this halves the gaps and leaves all else as it is
 _BOUNDARY_EVERY = 33
@@ -69,9 +69,9 @@ def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> N
     samples, jacobian = sampler.with_jacobian(
         max(_FEWEST, _SAMPLES * unknowns), _BOUNDARY_EVERY, sampler.generator(seed, _STREAM)
     )
+    jacobian = jacobian.permute(2, 1, 0).double()
     along = _along(jacobian)
-    wanted = torch.cat([samples.points[None], jacobian.permute(2, 0, 1)]).double()
-    target = _rows(wanted, along)
+    target = _rows(torch.cat([samples.points.t()[None], jacobian]), along)
     with torch.no_grad():
         if grid:
             _fit_tables(grid, network.linear_skip, samples.uv, along, target)
@@ -80,25 +80,37 @@ def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> N
 
 
 def _along(jacobian: Tensor) -> Tensor:
-    """√μ L (N, 2, 2), LLᵀ the inverse metric: its columns turn derivatives by u and v into those
-    along two orthonormal directions of the surface. Zero where a triangle has none."""
-    j = jacobian.double()
-    metric = j.transpose(1, 2) @ j
-    floor = _FLATTEST * metric.diagonal(dim1=1, dim2=2).mean(dim=1)
-    metric = metric + floor[:, None, None] * torch.eye(2, dtype=metric.dtype)
-    root = torch.linalg.cholesky_ex(torch.linalg.inv_ex(metric).inverse).L
-    known = torch.isfinite(root).all(dim=2).all(dim=1)
-    return _SLOPES**0.5 * torch.where(known[:, None, None], root, 0.0)
+    """√μ L (2, 2, N), LLᵀ the inverse metric: its columns turn derivatives by u and v into those
+    along two orthonormal directions of the surface. Zero where a triangle has none.
+
+    Args:
+        jacobian: (2, 3, N), the derivatives by u and v; points innermost, as everywhere here, so
+            that the processor has long rows.
+    """
+    du, dv = jacobian
+    a, b, c = (du * du).sum(dim=0), (du * dv).sum(dim=0), (dv * dv).sum(dim=0)
+    floor = _FLATTEST * 0.5 * (a + c)
+    a, c = a + floor, c + floor
+    determinant = a * c - b * b
+    root = torch.zeros(2, 2, len(a), dtype=a.dtype)
+    root[0, 0] = (c / determinant).sqrt()
+    root[1, 0] = -b / (determinant * root[0, 0])
+    root[1, 1] = c.rsqrt()
+    known = torch.isfinite(root).all(dim=0).all(dim=0)
+    return _SLOPES**0.5 * torch.where(known, root, 0.0)
 
 
 def _rows(stack: Tensor, along: Tensor) -> Tensor:
-    """Values and derivatives by u and v (3, N, d) to values and derivatives along the surface."""
-    return torch.cat([stack[:1], torch.einsum("ind,nij->jnd", stack[1:], along)])
+    """Values and derivatives by u and v (3, d, N) to values and derivatives along the surface."""
+    first, second = stack[1:]
+    slopes = [first * way[0] + second * way[1] for way in along.unbind(dim=1)]
+    return torch.stack([stack[0], *slopes])
 
 
 def _fit_tables(
     grid: SplineGrid, linear_skip: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
 ) -> None:
+    """As :func:`_fit_weights`, of the tables of a grid."""
     size = linear_skip.out_features
     if grid.features < size:
         raise ValueError(
@@ -107,14 +119,18 @@ def _fit_tables(
         )
     nn.init.zeros_(linear_skip.weight)
     nn.init.zeros_(linear_skip.bias)
-    left = target.clone()
+    # neighbours follow each other: what they see of a table, and add to, is near in memory
+    order = grid.seen(uv, len(grid.tables) - 1)[0][:, 0].argsort()
+    uv, along, left = uv[order], along[..., order], target[..., order]
     column = grid.out_dim - grid.features * len(grid.tables)  # past x itself, if it is a feature
     for level, table in enumerate(grid.tables):
-        count = min(len(uv), max(_FEWEST, _SAMPLES * len(table)))
-        found = torch.as_tensor(_best(grid, level, uv[:count], along[:count], left[:, :count]))
+        enough = order < max(_FEWEST, _SAMPLES * len(table))
+        some = (part if enough.all() else part[..., enough] for part in (uv.t(), along, left))
+        found = torch.as_tensor(_best(grid, level, *some))
         behind = len(uv) if level + 1 < len(grid.tables) else 0
-        for part, rows, weights in _seen(grid, level, uv[:behind], along):
-            left[:, part] -= (weights[..., None] * found[rows]).sum(dim=2)
+        for part, rows, weights in _seen(grid, level, uv.t()[:, :behind], along):
+            for k, coefficients in enumerate(found.t()):
+                left[:, k, part] -= (weights * coefficients[rows]).sum(dim=1)
         # tables of entries about 1, which steps of one rate suit
         scale = float(found.square().mean().sqrt().clamp(min=1e-30))
         table[:, :size] = found / scale
@@ -125,12 +141,12 @@ def _fit_tables(
 def _seen(
     grid: SplineGrid, level: int, uv: Tensor, along: Tensor
 ) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Which samples, the rows (n, k²) that they see of a level's table, and the weights (3, n, k²)
+    """Which samples, the rows (k², n) that they see of a level's table, and the weights (3, k², n)
     of these in the value and in the derivatives along the surface; part by part."""
-    for start in range(0, len(uv), _AT_ONCE):
+    for start in range(0, uv.shape[1], _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        rows, weights = grid.seen(uv[part].double(), level)
-        yield part, rows, _rows(weights, along[part])
+        rows, weights = grid.seen(uv[:, part].t().double(), level)
+        yield part, rows.t(), _rows(weights.transpose(1, 2), along[..., part])
 
 
 def _best(grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor) -> np.ndarray:
@@ -147,40 +163,53 @@ def _sums(
     grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor, cell: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the samples of each cell, which see the same rows of the table: products of the
-    weights (k⁴, rows), and of weights and target (rows, k², 3).
+    weights a and b of each pair a <= b of these rows (k² (k² + 1) / 2, rows), in the order of
+    ``_pairs``, and of weights and target (k², columns, rows).
 
     Args:
         cell: which of the rows that a sample sees has the number of its cell.
     """
-    rows, taps = len(grid.tables[level]), (grid.degree + 1) ** 2
-    columns = target.shape[2]
-    products = torch.zeros(rows, taps * taps, dtype=torch.float64)
-    wanted = torch.zeros(rows, taps * columns, dtype=torch.float64)
+    rows, taps, columns = len(grid.tables[level]), (grid.degree + 1) ** 2, target.shape[1]
+    pairs = _pairs(taps)
+    products, wanted = np.zeros((len(pairs), rows)), np.zeros((taps, columns, rows))
     for part, seen, weights in _seen(grid, level, uv, along):
-        pairs = torch.einsum("pna,pnb->nab", weights, weights)
-        products.index_add_(0, seen[:, cell], pairs.flatten(1))
-        with_target = torch.einsum("pna,pnk->nak", weights, target[:, part])
-        wanted.index_add_(0, seen[:, cell], with_target.flatten(1))
-    return products.t().contiguous().numpy(), wanted.view(rows, taps, columns).numpy()
+        of = seen[cell].numpy()
+        there = slice(of.min(), of.max() + 1)
+        of = of - there.start
+        for total, (a, b) in zip(products, pairs, strict=True):
+            total[there] += np.bincount(of, (weights[:, a] * weights[:, b]).sum(dim=0).numpy())
+        wished = target[..., part]
+        for a in range(taps):
+            for c in range(columns):
+                term = (weights[:, a] * wished[:, c]).sum(dim=0)
+                wanted[a, c, there] += np.bincount(of, term.numpy())
+    return products, wanted
+
+
+def _pairs(taps: int) -> list[tuple[int, int]]:
+    """The pairs (a, b), a <= b, of the places of a table that a sample sees."""
+    return [(a, b) for a in range(taps) for b in range(a, taps)]
 
 
 def _normal_equations(
     grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor
 ) -> tuple[csr_matrix, np.ndarray]:
     """The matrix (rows, rows) and right side (rows, 3) of the best entries."""
-    side, taps = grid.sides[level], (grid.degree + 1) ** 2
-    size, columns = side**2, target.shape[2]
+    side = grid.sides[level]
+    size, columns = side**2, target.shape[1]
     of_pairs, of_target = _sums(grid, level, uv, along, target, cell=0)
     # row r of the table is the first that cell r sees; the others lie at fixed offsets from it
     offsets = [i * side + j for i in range(grid.degree + 1) for j in range(grid.degree + 1)]
     diagonals: dict[int, np.ndarray] = {}
     right = np.zeros((size, columns))
     for a, down in enumerate(offsets):
-        right[down:] += of_target[: size - down, a]
-        for b, across in enumerate(offsets):
-            diagonal = diagonals.setdefault(across - down, np.zeros(size))
-            diagonal[across:] += of_pairs[a * taps + b, : size - across]
-    matrix = dia_matrix((np.stack(list(diagonals.values())), list(diagonals)), shape=(size, size))
+        right[down:] += of_target[a, :, : size - down].T
+    for products, (a, b) in zip(of_pairs, _pairs(len(offsets)), strict=True):
+        across = offsets[b]
+        diagonal = diagonals.setdefault(across - offsets[a], np.zeros(size))
+        diagonal[across:] += products[: size - across]
+    upper = dia_matrix((np.stack(list(diagonals.values())), list(diagonals)), shape=(size, size))
+    matrix = upper.tocsr() + triu(upper, 1).T
     bend = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(side - 2, side))
     line = identity(side)
     smooth = kron(bend.T @ bend, line) + kron(line, bend.T @ bend)
@@ -191,16 +220,27 @@ def _on_lattice(
     grid: LatticeSplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor
 ) -> tuple[csr_matrix, np.ndarray]:
     """As :func:`_normal_equations`, on a closed domain."""
-    size, columns = len(grid.tables[level]), target.shape[2]
+    size, columns = len(grid.tables[level]), target.shape[1]
     middle = (grid.degree + 1) ** 2 // 2
     of_pairs, of_target = _sums(grid, level, uv, along, target, cell=middle)
-    seen = grid.cell_rows(level).numpy()
-    down, across = np.repeat(seen, seen.shape[1], axis=1), np.tile(seen, seen.shape[1])
-    matrix = coo_matrix(
-        (of_pairs.T.ravel(), (down.ravel(), across.ravel())), shape=(size, size)
-    ).tocsr()
+    seen = grid.cell_rows(level).numpy().T.astype(np.int32)
+    # near a cone two places of a cell are one row: what they have in common counts for both orders
+    own = sum(
+        np.bincount(seen[a], products, size)
+        for products, (a, b) in zip(of_pairs, _pairs(len(seen)), strict=True)
+        if a == b
+    )
+    unequal = [k for k, (a, b) in enumerate(_pairs(len(seen))) if a < b]
+    down, across = (
+        np.concatenate([seen[_pairs(len(seen))[k][end]] for k in unequal]) for end in (0, 1)
+    )
+    upper = coo_matrix((of_pairs[unequal].ravel(), (down, across)), shape=(size, size)).tocsr()
+    matrix = upper + upper.T + diags(own)
     right = np.stack(
-        [np.bincount(seen.ravel(), of_target[:, :, k].ravel(), size) for k in range(columns)],
+        [
+            sum(np.bincount(seen[a], of_target[a, k], size) for a in range(len(seen)))
+            for k in range(columns)
+        ],
         axis=1,
     )
     n, m = grid.cells(level)
@@ -225,10 +265,11 @@ def _fit_weights(
     encoding: Encoding, linear_skip: nn.Linear, uv: Tensor, along: Tensor, target: Tensor
 ) -> None:
     """Features without tables stay as they are: the linear skip's weights alone are fitted."""
-    features = torch.cat([value_and_jacobian_stack(encoding, uv), torch.zeros(3, len(uv), 1)], 2)
-    features[0, :, -1] = 1.0  # the bias
-    design = _rows(features.double(), along).flatten(0, 1)
-    normal, right = design.t() @ design, design.t() @ target.flatten(0, 1)
+    stack = value_and_jacobian_stack(encoding, uv).transpose(1, 2).double()
+    features = torch.cat([stack, torch.zeros(3, 1, len(uv), dtype=stack.dtype)], dim=1)
+    features[0, -1] = 1.0  # the bias
+    design = _rows(features, along).transpose(0, 1).flatten(1)
+    normal, right = design @ design.t(), design @ target.transpose(0, 1).flatten(1).t()
     normal += _RIDGE * normal.diagonal().mean() * torch.eye(len(normal))
     found = torch.linalg.solve(normal, right).t()
     linear_skip.weight.copy_(found[:, :-1])

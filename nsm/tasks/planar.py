@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from nsm.errors import NsmError
-from nsm.instantiation import named_object
-from nsm.maps import PlanarMap, SplineField
+from nsm.instantiation import named_object, target_of
+from nsm.maps import MultilevelSpline, NeuralMap, PlanarMap, PlanarNetwork, SplineField
 from nsm.maps.networks import build_network
 
 
@@ -29,11 +31,18 @@ def planar_map(
             kind="unknown_option",
             key="map.linear_skip",
         )
-    out_dim = 2
+    out_dim, kind = 2, named_object(map.get("_target_", target_of(NeuralMap)))
     if domain is not None:
         out_dim = domain.network_out_dim
-        encoding = domain.encoding(encoding, of_map=True)
-        if not domain.has_boundary and named_object(map.get("_target_", "")) is SplineField:
-            map = {**map, "periodic": True, "odd": domain.even}
+        periodic = domain.encoding(encoding, of_map=True)
+        if not domain.has_boundary:
+            if kind is PlanarNetwork:
+                finest = max(4, int(np.max(encoding.get("resolutions", periodic["resolutions"]))))
+                return domain.equivariant(MultilevelSpline(2, finest + finest % 2, domain.even))
+            if kind is SplineField:
+                map = {**map, "periodic": True, "odd": domain.even}
+        encoding = periodic
+    if kind is PlanarNetwork:
+        map = {**map, "_target_": target_of(NeuralMap)}
     network = build_network(map=map, activation=activation, encoding=encoding, out_dim=out_dim)
     return PlanarMap(network) if domain is None else domain.equivariant(network)

@@ -108,8 +108,12 @@ class Distortion:
     def _mean(self, values: Tensor) -> Tensor:
         if self.share is None:
             return values.sum() / mean_of_processes(values.new_tensor(max(1, values.numel())))
-        weight = mean_of_processes(self.share.sum(dim=-1)).clamp(min=1e-12)
-        return ((self.share * values).sum(dim=-1) / weight).mean()
+        return self._means(values, self.share).mean()
+
+    @staticmethod
+    def _means(values: Tensor, share: Tensor) -> Tensor:
+        weight = mean_of_processes(share.sum(dim=-1)).clamp(min=1e-12)
+        return (share * values).sum(dim=-1) / weight
 
     @property
     def terms(self) -> dict[str, Term]:
@@ -126,6 +130,12 @@ class Distortion:
     def mean(self) -> Tensor:
         """The mean of the blend, zero if there are no samples."""
         return self._mean(self.values)
+
+    @property
+    def means(self) -> Tensor:
+        """The mean of the blend over the samples of each map (...)."""
+        values = self.values
+        return self._means(values, torch.ones_like(values) if self.share is None else self.share)
 
 
 def mean_of_processes(amount: Tensor) -> Tensor:

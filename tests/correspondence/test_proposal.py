@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from nsm.correspondence import proposed
+from nsm.correspondence import proposal, proposed, proposed_for_all, search
 from nsm.correspondence.coarse_shape import coarse_shape
 from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
-from nsm.correspondence.search import Candidate
+from nsm.correspondence.search import Candidate, Round
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.cover import lifted_near, located
 from nsm.errors import NsmError
@@ -33,6 +33,18 @@ def star(lengths, width=0.35):
     return radius[:, None] * points, np.array(ball.faces), angle.argmin(axis=0)
 
 
+CORNERS = [(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)]
+
+
+def tetrapod():
+    """A ball with four equal limbs, as a tetrahedron has corners."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    points = np.array(ball.vertices)
+    angle = np.arccos(np.clip(points @ np.array(CORNERS).T / np.sqrt(3), -1, 1))
+    radius = 1 + 2 * np.exp(-((angle / 0.35) ** 2)).sum(axis=1)
+    return radius[:, None] * points, np.array(ball.faces)
+
+
 @pytest.fixture(scope="module")
 def pair():
     """A shape, and the same with other lengths, turned, with other numbers and in another unit."""
@@ -47,32 +59,36 @@ def pair():
     return (vertices, faces), (moved, number[faces]), (tips, number[tips])
 
 
-def test_a_turned_and_stretched_shape_is_recognised(pair):
+@pytest.fixture
+def quick(monkeypatch):
+    """A search of fewer maps, enough for shapes that are equal or nearly so."""
+    rounds = (Round(60, 3, 10), Round(10, 6, 30, directed=True))
+    monkeypatch.setattr(search, "_SOURCE_SETS", 1)
+    monkeypatch.setattr(search, "_TARGET_SETS", 6)
+    monkeypatch.setattr(proposal, "candidates", lambda s, t: search.candidates(s, t, rounds))
+
+
+def test_a_turned_and_stretched_shape_is_recognised(pair, quick):
     source, target, tips = pair
-    proposal = proposed(source, target)
-    assert proposal.sure
-    best = proposal.hypotheses[0]
+    found = proposed(source, target)
+    assert found.sure
+    best = found.hypotheses[0]
     assert 4 <= len(best.vertices) <= 5
     for p, q in best.vertices:  # each near the tip of one and the same limb
         limb = np.linalg.norm(source[0][tips[0]] - source[0][p], axis=1)
         its = np.linalg.norm(target[0][tips[1]] - target[0][q], axis=1)
         assert limb.argmin() == its.argmin()
         assert limb.min() < 0.3 and its.min() < 40 * 0.3  # limbs are 1.3 long or more
-    scores = [h.score for h in proposal.hypotheses]
-    assert scores == sorted(scores) and proposal.margin == pytest.approx(scores[1] - scores[0])
+    scores = [h.score for h in found.hypotheses]
+    assert scores == sorted(scores) and found.margin == pytest.approx(scores[1] - scores[0])
     assert best.energy < 5 and best.distance_change < 0.05
 
 
-def test_nothing_is_sure_where_all_is_alike():
-    """Four equal limbs, as a tetrahedron has corners: twelve rotations are equally good."""
-    corners = [(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)]
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    points = np.array(ball.vertices)
-    angle = np.arccos(np.clip(points @ np.array(corners).T / np.sqrt(3), -1, 1))
-    mesh = (1 + 2 * np.exp(-((angle / 0.35) ** 2)).sum(axis=1))[:, None] * points
-    proposal = proposed((mesh, np.array(ball.faces)), (mesh, np.array(ball.faces)))
-    assert not proposal.sure
-    assert len(proposal.hypotheses) > 1
+def test_nothing_is_sure_where_all_is_alike(quick):
+    """Twelve rotations are equally good."""
+    found = proposed(tetrapod(), tetrapod())
+    assert not found.sure
+    assert len(found.hypotheses) > 1
 
 
 @pytest.mark.parametrize("mesh", [torus(), hemisphere()])
@@ -130,3 +146,41 @@ def test_affine_maps_take_cones_to_cones_in_all_orders(layouts):
         assert lifted_near(2 * group.CONES[at], image, True) == pytest.approx(image)
         orders.add(tuple(at.tolist()))
     assert len(orders) == 24
+
+
+def test_given_landmarks_are_kept_and_decide_between_symmetric_maps(quick):
+    """Four equal limbs, as a tetrahedron has corners: two given limbs leave one rotation of twelve.
+
+    Both lie beside the tips, so that they are no cones."""
+    source, faces = tetrapod()
+    tips = np.array([int((source @ c).argmax()) for c in CORNERS])
+    beside = [np.flatnonzero(faces == v) for v in tips]
+    beside = [int(faces[at[0] // 3][(at[0] % 3 + 1) % 3]) for at in beside]
+    given = np.array([[beside[0], beside[1]], [beside[1], beside[0]]])
+    found = proposed((source, faces), (source, faces), given)
+    assert found.sure and found.given == 2
+    best = found.hypotheses[0].vertices
+    assert best[:2].tolist() == given.tolist()
+    limb = ((source @ np.array(CORNERS).T).argmax(axis=1))[best]
+    # the half-turn that exchanges the first two exchanges the others
+    assert dict(limb.tolist()) == {0: 1, 1: 0, 2: 3, 3: 2}
+    assert found.hypotheses[0].missed < 0.05
+
+
+def test_a_collection_is_matched_with_one_hub(pair, quick):
+    source, target, tips = pair
+    turn = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])[:3, :3]
+    meshes = [source, target, (3 * source[0] @ turn.T, source[1])]
+    found = proposed_for_all(meshes, np.array([[tips[0][0], tips[1][0], tips[0][0]]]))
+    assert found.sure and found.given == 1 and found.scores == sorted(found.scores)
+    best = found.vertices[0]
+    assert len(best) >= 4
+    assert best[0].tolist() == [tips[0][0], tips[1][0], tips[0][0]]
+    ends = (tips[0], tips[1], tips[0])
+    limbs = [
+        np.linalg.norm(mesh[0][best[:, k], None] - mesh[0][ends[k]], axis=2).argmin(axis=1)
+        for k, mesh in enumerate(meshes)
+    ]
+    assert np.array_equal(limbs[0], limbs[1]) and np.array_equal(limbs[0], limbs[2])
+    for other in found.vertices[1:]:
+        assert other[0].tolist() == best[0].tolist()  # the given one in every hypothesis

@@ -11,13 +11,20 @@ from scipy.linalg import expm
 from thorough import examples
 
 from nsm.correspondence.layouts import _logarithm
-from nsm.correspondence.refinement import Batch, Sines, _exponential, refined
+from nsm.correspondence.refinement import (
+    Anchors,
+    Batch,
+    Directions,
+    Sines,
+    _exponential,
+    refined,
+)
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-1, 1, (200, 2))
 
 
-def flat(tables, matrices, shifts, largest=2, metric=None):
+def flat(tables, matrices, shifts, largest=2, metric=None, **more):
     """A batch whose source is the plane: the unit square metric at random points."""
     count = len(POINTS)
     inverse = np.tile(np.eye(2) if metric is None else np.linalg.inv(metric), (count, 1, 1))
@@ -29,6 +36,7 @@ def flat(tables, matrices, shifts, largest=2, metric=None):
         np.array(matrices),
         np.array(shifts),
         largest,
+        **more,
     )
 
 
@@ -125,3 +133,39 @@ def test_training_finds_the_isometry():
     assert energies[:2].numpy() == pytest.approx([least, least], abs=0.02)
     # the other isotopy class holds no isometry
     assert energies[2] > 2 * least
+
+
+def test_anchors_are_drawn_to_the_nearest_of_all_lifts():
+    """Against all lifts of the place in a large window."""
+    matrix, shift = np.array([[1, 1], [0, 1]]), np.array([1, 0])
+    shape = np.array([[1.2, 0.3], [0.0, 0.8]])
+    points, places = RNG.uniform(-1, 1, (5, 2)), RNG.uniform(-1, 1, (5, 2))
+    anchors = Anchors(points, places[None], shape[None], 7.0)
+    batch = flat([constant(np.eye(2))], [matrix], [shift], anchors=anchors)
+    amplitudes = 0.1 * RNG.normal(size=(12, 2))
+    image = (points + Sines.up_to(2).basis(points)[0] @ amplitudes) @ matrix.T + shift
+    window = 2 * np.stack(np.meshgrid(*[np.arange(-6, 7)] * 2), axis=-1).reshape(-1, 2)
+    lifts = np.concatenate([places[:, None] + window, window - places[:, None]], axis=1)
+    flat_off = np.rint((image[:, None] - lifts) / 1e-12) * 1e-12
+    coordinates = np.abs(flat_off).max(axis=2) <= 1  # nearest in coordinates, then in the plane
+    squared = ((flat_off @ shape.T) ** 2).sum(axis=2)
+    expected = np.where(coordinates, squared, np.inf).min(axis=1).sum()
+    given_ = torch.as_tensor(amplitudes[None], dtype=torch.float32)
+    assert batch.gaps(given_).item() == pytest.approx(expected, rel=1e-4)
+    added = (batch.losses(given_) - batch.energies(given_)).item()
+    assert added == pytest.approx(7 * expected, rel=1e-3)
+    drawn, _ = refined(batch, torch.zeros(1, 12, 2), 100)
+    assert batch.gaps(drawn).item() < 0.5 * batch.gaps(torch.zeros(1, 12, 2)).item()
+
+
+@given(st.floats(0, np.pi))
+@examples(10)
+def test_normals_count_by_the_angle_between_them(angle):
+    ours = np.tile([0.0, 0.0, 1.0], (1, len(POINTS), 1))
+    theirs = np.tile([np.sin(angle), 0.0, np.cos(angle)], (1, 8, 8, 1))
+    directions = Directions(ours, theirs, 3.0)
+    batch = flat([constant(np.eye(2))], [np.eye(2)], [(0, 0)], directions=directions)
+    nothing = torch.zeros(1, 12, 2)
+    assert batch.turns(nothing).item() == pytest.approx(1 - np.cos(angle), abs=1e-5)
+    added = (batch.losses(nothing) - batch.energies(nothing)).item()
+    assert added == pytest.approx(3 * (1 - np.cos(angle)), abs=1e-4)

@@ -136,6 +136,20 @@ def test_pool_holds_every_vertex(uneven):
     assert float(nearest(batch.points, pool.points).max()) < 1e-6
 
 
+def test_every_batch_can_have_all_vertices(uneven):
+    data = SurfaceData(uneven, Sampler(pool=1000, every_vertex=True), batch_size=64)
+    data.setup()
+    count, pool = len(uneven.vertices), data.own_sampler.fixed
+    assert len(pool.points) == 1000  # of the surface alone
+    assert float(nearest(pool.points, data.points.vertices).max()) > 1e-3
+    for step in (0, 1):
+        batch = data.batch(step)
+        assert len(batch.uv) == 64 + count
+        assert torch.equal(batch.points[64:], data.points.vertices)
+        assert float(nearest(batch.points[:64], pool.points).max()) == 0
+    assert not torch.equal(data.batch(0).points[:64], data.batch(1).points[:64])
+
+
 def test_held_out_points_are_not_trained_on(uneven):
     data = SurfaceData(uneven, batch_size=512, held_out=512)
     data.setup()

@@ -10,6 +10,7 @@ from nsm.domains.decimation import Rings, coarsen, present_faces, undo
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.tutte import tutte
 from nsm.domains.vertex_relaxation import Freedom, Stars, relax
+from nsm.errors import NsmError
 from nsm.surfaces import shapes, topology
 from nsm.surfaces.geometry import triangle_distortion
 
@@ -136,3 +137,31 @@ def test_what_does_not_carry_over_is_laid_out_at_once(monkeypatch):
     surface = Surface.from_arrays(vertices, faces)
     assert any("laid out at once" in line for line in surface.log)
     assert flipped_triangles(surface.uv, surface.faces) == 0
+
+
+def finger(around: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """A tube of the disc's area, open below and closed at its tip, which Tutte puts off centre."""
+    angle = 2 * np.pi * (np.arange(around) / around) ** 1.5
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    up = 0.6 * np.arange(rings)[:, None, None] * [0.0, 0.0, 1.0]
+    vertices = np.concatenate([(ring + up).reshape(-1, 3), [[0.0, 0.0, 0.6 * rings]]])
+    k, i = np.divmod(np.arange((rings - 1) * around), around)
+    a, b = k * around + i, k * around + (i + 1) % around
+    sides = np.concatenate(
+        [np.stack(t, axis=1) for t in ((a, b, b + around), (a, b + around, a + around))]
+    )
+    last, i = (rings - 1) * around, np.arange(around)
+    tip = np.stack([last + i, last + (i + 1) % around, np.full(around, rings * around)], axis=1)
+    faces = np.concatenate([sides, tip])
+    return vertices * np.sqrt(np.pi / topology.face_areas(vertices, faces).sum()), faces
+
+
+def test_a_long_finger_is_laid_out_where_tuttes_embedding_loses_precision():
+    vertices, faces = finger(8, 90)
+    with pytest.raises(NsmError) as error:
+        embedding.embed(Disc(), vertices, faces, method="tutte")
+    assert error.value.kind == "not_injective"
+    layout = embedding.embed(Disc(), vertices, faces)
+    assert any("coarse to fine" in line for line in layout.log)
+    assert flipped_triangles(layout.uv, faces) == 0
+    assert boundary_self_intersections(layout.uv, topology.boundary_loops(faces)[0]) == 0

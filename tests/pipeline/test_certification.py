@@ -52,6 +52,8 @@ def test_a_map_that_flips_is_repaired(ends, tmp_path):
     assert repaired["certified"] is True and repaired["flipped_triangles"] == 0
     assert repaired["before_repair"] == told["before_repair"]
     assert f.metrics["flipped_percent"] == 0 and f.metrics["certified"] is True
+    share = 100 * told["before_repair"]["flipped_triangles"] / len(ends[0].surface.faces)
+    assert f.metrics["flipped_before_repair_percent"] == pytest.approx(share)
     assert nsm.load(tmp_path / "repaired").certificate["certified"]
 
 

@@ -11,7 +11,7 @@ import torch
 import trimesh
 from domains.orbifold.shapes import limbs, torus
 from rich.console import Console
-from scipy.sparse import load_npz
+from tensor_checks import check_correspondences, check_tensors, check_weights
 
 import nsm
 from nsm.config import compose_config
@@ -99,7 +99,7 @@ def test_copies_of_a_vertex_have_one_image(made):
     assert len(a)
     diagonal = f.target.surface.bounding_box_diagonal
     assert np.abs(f.image[a] - f.image[b]).max() <= 1e-7 * diagonal
-    by_network = f.target(evaluate(f.map, s.uv))
+    by_network = evaluate(f.target.map, evaluate(f.map, s.uv))
     assert np.abs(by_network[a] - by_network[b]).max() <= 1e-4 * diagonal
 
 
@@ -144,8 +144,16 @@ def test_points_and_values_go_back(made):
     assert np.median(off) < 1e-3 * diagonal and off.max() < 0.05 * diagonal
     values = source.vertices[:, 1]
     np.testing.assert_allclose(f.matrix() @ values, f.transfer(values), atol=1e-9)
-    stored = load_npz(folder / "source_to_target.npz")
-    np.testing.assert_allclose(stored @ values, f.transfer(values), atol=1e-9)
+    stored = np.load(folder / "correspondences.npz")
+    corners, weights = (stored[f"target_to_source_{n}"] for n in ("vertices", "barycentric"))
+    np.testing.assert_allclose((values[corners] * weights).sum(axis=1), f.transfer(values))
+
+
+def test_closed_maps_take_tensors_and_correspond(made):
+    _, f, _, _ = made
+    check_tensors(f)
+    check_weights(f)
+    check_correspondences(f)
 
 
 def test_a_stored_map_is_the_same(made):

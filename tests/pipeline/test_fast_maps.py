@@ -115,8 +115,8 @@ def small(task, *words):
 def test_a_fast_flattening_lowers_the_energy(surfaces, tmp_path):
     words = ["trainer.max_steps=3", "certification.rounds=0"]
     f = run_task(small("param", *words), tmp_path / "run", Given(phi=surfaces[1]))
-    uv = torch.as_tensor(f.source.surface.uv, dtype=torch.float32)
-    source = first_fundamental_form(f.source.map.value_and_jacobian(uv)[1])
+    uv = torch.as_tensor(surfaces[1].surface.uv, dtype=torch.float32)
+    source = first_fundamental_form(surfaces[1].map.value_and_jacobian(uv)[1])
     flat = first_fundamental_form(f.map.value_and_jacobian(uv)[1])
     before = symmetric_dirichlet(source, torch.eye(2).expand_as(source)).mean()
     after = symmetric_dirichlet(source, flat).mean()
@@ -125,7 +125,7 @@ def test_a_fast_flattening_lowers_the_energy(surfaces, tmp_path):
 
 
 def test_a_fast_collection_meets_its_landmarks(surfaces, tmp_path):
-    marks = [[a, b, a] for a, b in MARKS]
+    marks = [list(each) for each in zip(*[(a, b, a) for a, b in MARKS], strict=True)]
     given = Given(surfaces=[*surfaces, surfaces[0]], landmarks=marks)
     f = run_task(small("collection_map", "trainer.max_steps=6"), tmp_path / "run", given)
     assert f.certificate["certified"]

@@ -1,5 +1,6 @@
 """Maps between surfaces, as users run them: from meshes, ready surfaces, in Python, resumed."""
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -8,22 +9,34 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from rich.console import Console
+from tensor_checks import check_correspondences, check_tensors, check_weights
 
 import nsm
 from nsm.config import compose_config
+from nsm.domains import Square
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
-from nsm.pipeline import Given, run_task
-from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.pipeline import Given, built, make_task, run_task
+from nsm.pipeline.landmark_inputs import landmark_vertices
+from nsm.results import analytic_surface
 from nsm.results.metrics import evaluate
 from nsm.results.textured_mesh import TexturedMesh
 from nsm.surfaces.atlas import unwrapped
 from nsm.surfaces.geometry import point_mesh_distance
 from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.shapes import grid_mesh
 from nsm.surfaces.textures import read_texture
 
 QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
 MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'
+PENALTY = [
+    "constraints.boundary=penalty",
+    "constraints.landmarks=fixed",
+    "constraints.ramp=0",
+    "loss_weights.seam=0",
+    "loss_weights.triangles=0",
+]
 SEAM = "seam.path=shortest"
 POINTS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0.0]])
 
@@ -89,6 +102,10 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         "morph.png",
         "morph.gif",
         "morph/08.obj",
+        "morph.glb",
+        "correspondences.npz",
+        "reliability.ply",
+        "reliability.png",
     ):
         assert (folder / name).stat().st_size > 0, name
 
@@ -150,7 +167,16 @@ def test_points_go_to_the_target_in_its_own_units(made, files):
 def test_points_may_be_tensors_that_a_gradient_is_wanted_of(made):
     _, f = made
     points = torch.tensor(f.source.in_original_units(f.source.surface.vertices[:5]))
-    assert np.array_equal(f(points.requires_grad_()), f(points.detach().numpy()))
+    image = f(points.requires_grad_())
+    assert image.requires_grad
+    assert np.allclose(image.detach().numpy(), f(points.detach().numpy()), rtol=0, atol=1e-9)
+
+
+def test_maps_of_cut_surfaces_take_tensors_and_correspond(made):
+    _, f = made
+    check_tensors(f)
+    check_weights(f)
+    check_correspondences(f)
 
 
 def test_results_are_shown_in_a_line(made, trio):
@@ -201,10 +227,11 @@ def test_a_file_with_copies_of_vertices_in_other_units(made, files, tmp_path):
 
 def test_a_morph_begins_at_the_source_and_ends_at_the_image(made):
     _, f = made
-    assert (f.morph(0.0) == f.source.surface.vertices).all()
-    end, image = f.morph(1.0), f.image
+    vertices, faces = f.source.file_mesh()
+    assert (f.morph(0.0) == vertices).all()
+    end, image = f.morph(1.0), f.welded_image / f.source.surface.scale
     # a rigid motion keeps all distances
-    edges = f.source.surface.faces[:, :2]
+    edges = faces[:, :2]
     lengths = [np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (end, image)]
     assert np.abs(lengths[0] - lengths[1]).max() < 1e-9
 
@@ -215,14 +242,30 @@ def test_figures_agree_with_an_independent_count(made):
     a, b, c = (np.c_[f.image_uv, np.zeros(len(s.uv))][s.faces[:, k]] for k in range(3))
     flipped = (np.cross(b - a, c - a)[:, 2] <= 0).mean()
     assert f.metrics["flipped_percent"] == 100 * flipped
-    # symmetric Dirichlet by singular values of each triangle's affine map
+    median = np.median(distortions(s, f.image))
+    assert f.metrics["symmetric_dirichlet_median"] == pytest.approx(median, rel=1e-6)
+
+
+def distortions(s, image):
+    """Symmetric Dirichlet by singular values of each triangle's affine map."""
     values = []
-    for x, y in zip(s.vertices[s.faces], f.image[s.faces], strict=True):
+    for x, y in zip(s.vertices[s.faces], image[s.faces], strict=True):
         e, g = np.stack([x[1] - x[0], x[2] - x[0]], 1), np.stack([y[1] - y[0], y[2] - y[0]], 1)
         q, r = np.linalg.qr(e)
         sigma = np.linalg.svd(g @ np.linalg.inv(r), compute_uv=False)
         values.append((sigma**2).sum() + (1 / (sigma**2 + 0.01)).sum())
-    assert f.metrics["symmetric_dirichlet_median"] == pytest.approx(np.median(values), rel=1e-6)
+    return values
+
+
+def test_a_map_is_compared_with_its_start(made):
+    _, f = made
+    s, t = f.source.surface, f.target.surface
+    image = t.at(s.uv @ f.map.rotation.double().numpy().T)
+    found = f.metrics["start_symmetric_dirichlet_median"]
+    assert found == pytest.approx(np.median(distortions(s, image)), rel=1e-6)
+    assert found > f.metrics["symmetric_dirichlet_median"]
+    assert f.metrics["start_flipped_percent"] == 0  # a rotation of Ω
+    assert f.metrics["start_landmark_error_max_percent"] > 1
 
 
 def test_neural_surfaces_that_are_ready_are_mapped_as_they_are(made):
@@ -272,9 +315,24 @@ def on_the_square():
     return nsm.map_pair(
         "saddle",
         "plane",
-        overrides=[*QUICK, MADE, "domain=square", "constraints=paper_pair", "trainer.max_steps=60"],
+        overrides=[*QUICK, MADE, "domain=square", *PENALTY, "trainer.max_steps=60"],
         progress=False,
     )
+
+
+def test_the_corners_of_the_square_are_key_points_of_a_collection(monkeypatch):
+    monkeypatch.setattr(Square, "mesh", lambda self, rings=12: grid_mesh(8))
+    config = compose_config(["task=collection_map", "experiment=paper", "domain=square"])
+    task = make_task(config, Console(quiet=True))
+    shapes = [analytic_surface({"name": n}, Square()) for n in ("plane", "saddle", "paraboloid")]
+    task.use(shapes, [np.zeros(0, dtype=np.int64)] * 3)
+    module = built(task)
+    corners = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    assert sorted(module.points.tolist()) == sorted(corners.tolist())
+    for k, targets in enumerate(module.targets):
+        assert sorted(targets.round(decimals=5).tolist()) == sorted(corners.tolist())
+        # h_k starts as a turn of the square by quarters
+        torch.testing.assert_close(module.map[k](module.points), targets, atol=1e-5, rtol=0)
 
 
 def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
@@ -318,12 +376,29 @@ def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")
-def trio():
+def folder_of_trio(tmp_path_factory):
+    return tmp_path_factory.mktemp("trio")
+
+
+@pytest.fixture(scope="module")
+def trio(folder_of_trio):
     return nsm.map_collection(
         ["hemisphere", "saddle", "cone"],
-        overrides=[*QUICK, MADE, "trainer.max_steps=150"],
+        overrides=[*QUICK, MADE, "trainer.max_steps=150", "logger=csv", "artefacts=false"],
+        folder=folder_of_trio,
         progress=False,
     )
+
+
+def test_each_pair_of_a_collection_has_a_curve(trio, folder_of_trio):
+    with (folder_of_trio / "csv" / "metrics.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["val/distortion"]]
+    assert len(rows) == 3
+    names = [f"pairs/{name.replace(' → ', '_to_')}" for name in trio.metrics["pairs"]]
+    assert sorted(names) == sorted(name for name in rows[0] if name.startswith("pairs/"))
+    for row in rows:
+        mean = np.mean([float(row[name]) for name in names])
+        assert mean == pytest.approx(float(row["val/distortion"]), rel=1e-5)
 
 
 def test_a_collection_maps_every_surface_to_every_other(trio):
@@ -331,6 +406,13 @@ def test_a_collection_maps_every_surface_to_every_other(trio):
     for figures in trio.metrics["pairs"].values():
         assert figures["flipped_percent"] == 0
         assert figures["symmetric_dirichlet_median"] < 6
+        assert figures["start_flipped_percent"] == 0
+    for (i, j), name in trio.pair_names.items():
+        s, t = trio.surfaces[i].surface, trio.surfaces[j].surface
+        first, then = (trio.maps[k].rotation.double().numpy() for k in (i, j))
+        median = np.median(distortions(s, t.at(s.uv @ first @ then.T)))
+        found = trio.metrics["pairs"][name]["start_symmetric_dirichlet_median"]
+        assert found == pytest.approx(median, rel=1e-5)
     assert trio.metrics["cycle_error_networks_mean_percent"] < 0.01
     assert trio.metrics["cycle_error_mean_percent"] < 0.2
 

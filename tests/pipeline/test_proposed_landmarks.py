@@ -1,21 +1,23 @@
 """landmarks=auto: what is said, written and refused, with a proposal that is known."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from rich.console import Console
+from tiny import results
 
-from nsm.correspondence import Hypothesis, Proposal
-from nsm.domains import DOMAINS
+from nsm.config import compose_config
+from nsm.correspondence import CollectionProposal, Hypothesis, Proposal
+from nsm.domains import DOMAINS, Surface
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline import proposed_landmarks
-from nsm.pipeline.proposed_landmarks import asks_for_proposal, propose_landmarks
-from nsm.surfaces.landmark_files import read_pairs
+from nsm.pipeline.proposed_landmarks import given_or_proposed
+from nsm.surfaces.landmark_files import read_collection, read_pairs
 from nsm.surfaces.shapes import sphere
-from nsm.surfaces.validation import Repairs
 
 
 def meshes():
@@ -30,65 +32,150 @@ def meshes():
 def answers(monkeypatch, margin, score=2.0):
     """Let the search answer with two hypotheses, in the numbers of cleaned meshes."""
     found = [
-        Hypothesis(np.array([[k, 10 + k] for k in range(first, first + 4)]), s, 5.0, 0, 0, None)
-        for first, s in ((0, score), (20, score + margin))
+        Hypothesis(np.array([[k, 10 + k] for k in range(n, n + 4)]), s, 5.0, 0, 0, 0, 0, None)
+        for n, s in ((0, score), (20, score + margin))
     ]
-    monkeypatch.setattr(proposed_landmarks, "proposed", lambda *_: Proposal(found, margin))
+
+    def completed(source, target, given):
+        kept = [replace(h, vertices=np.concatenate([given, h.vertices])) for h in found]
+        return Proposal(kept, margin)
+
+    monkeypatch.setattr(proposed_landmarks, "proposed", completed)
 
 
-def proposed_with(margin, monkeypatch, strict=False, alternative=0, score=2.0):
-    answers(monkeypatch, margin, score)
+ORBIFOLD, DISC = DOMAINS["orbifold"], DOMAINS["disc"]
+
+
+def take(landmarks, *words, shapes=None, domain=ORBIFOLD):
+    """The landmarks of two spheres, the proposal, and what is said."""
     console = Console(record=True, width=300)
-    found = propose_landmarks(meshes(), strict, alternative, True, console)
-    return found, console.export_text()
+    config = compose_config(["task=pair_map", *words])
+    _, ids, found = given_or_proposed(landmarks, shapes or meshes(), domain, config, console)
+    return [x.tolist() for x in ids], found, console.export_text()
+
+
+def proposed_with(margin, monkeypatch, *words, score=2.0):
+    answers(monkeypatch, margin, score)
+    return take("auto", *words)
 
 
 def test_a_sure_proposal_is_taken_in_the_numbers_of_the_files(monkeypatch, tmp_path):
-    given, said = proposed_with(0.5, monkeypatch)
+    ids, found, said = proposed_with(0.5, monkeypatch)
     # the second file has a vertex more in front
-    assert given.landmarks == {"source": [0, 1, 2, 3], "target": [11, 12, 13, 14]}
+    assert ids == [[0, 1, 2, 3], [11, 12, 13, 14]]
     assert "WARNING" not in said and "0.500" in said
-    (tmp_path / "landmarks.json").write_text(given.to_json())
-    source, target = read_pairs(tmp_path / "landmarks.json")
-    assert {"source": source, "target": target} == given.landmarks
+    (tmp_path / "landmarks.json").write_text(found.to_json())
+    assert list(read_pairs(tmp_path / "landmarks.json")) == ids
 
 
 def test_an_unsure_one_is_a_warning_or_an_error(monkeypatch):
     for margin, score in ((0.01, 2.0), (0.5, 3.5)):
-        _, said = proposed_with(margin, monkeypatch, score=score)
+        _, _, said = proposed_with(margin, monkeypatch, score=score)
         assert "WARNING" in said
         with pytest.raises(NsmError) as refused:
-            proposed_with(margin, monkeypatch, strict=True, score=score)
+            proposed_with(margin, monkeypatch, "proposal.strict=true", score=score)
         assert (refused.value.kind, refused.value.key) == ("unsure_landmarks", "proposal.strict")
-    proposed_with(0.5, monkeypatch, strict=True)
+    proposed_with(0.5, monkeypatch, "proposal.strict=true")
 
 
 def test_the_second_best_is_one_flag_away(monkeypatch):
-    given, _ = proposed_with(0.01, monkeypatch, alternative=1)
-    assert given.landmarks["source"] == [20, 21, 22, 23]
-    assert '"source": [0, 1, 2, 3]' in given.to_json()  # the best is kept among alternatives
+    ids, found, _ = proposed_with(0.01, monkeypatch, "proposal.alternative=1")
+    assert ids[0] == [20, 21, 22, 23]
+    assert '"source": [0, 1, 2, 3]' in found.to_json()  # the best is kept among alternatives
     with pytest.raises(NsmError) as refused:
-        proposed_with(0.01, monkeypatch, alternative=2)
+        proposed_with(0.01, monkeypatch, "proposal.alternative=2")
     assert (refused.value.kind, refused.value.key) == ("out_of_range", "proposal.alternative")
 
 
 def test_only_meshes_are_proposed_for():
     with pytest.raises(NsmError) as refused:
-        propose_landmarks([meshes()[0], SimpleNamespace()], False, 0, True, Console(quiet=True))
+        take("auto", shapes=[meshes()[0], SimpleNamespace()])
     assert (refused.value.kind, refused.value.key) == ("wrong_type", "landmarks")
 
 
-def test_closed_meshes_without_landmarks_have_some_proposed():
-    orbifold, disc = DOMAINS["orbifold"], DOMAINS["disc"]
-    assert asks_for_proposal(None, meshes(), orbifold)
-    assert asks_for_proposal("auto", meshes(), disc)
-    for landmarks, shapes, domain in (
-        (None, meshes(), disc),
-        ([], meshes(), orbifold),
-        ("pairs.json", meshes(), orbifold),
-        (None, [meshes()[0], SimpleNamespace()], orbifold),
-    ):
-        assert not asks_for_proposal(landmarks, shapes, domain)
+def test_closed_meshes_without_landmarks_have_some_proposed(monkeypatch):
+    answers(monkeypatch, 0.5)
+    assert take(None)[1] and take("auto", domain=DISC)[1]
+    assert take(None, domain=DISC)[1] is None
+    assert take([])[1] is None
+    assert take(None, shapes=[meshes()[0], results(2).neural[0]])[1] is None
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_one_to_four_given_landmarks_are_kept_and_completed(count, monkeypatch):
+    answers(monkeypatch, 0.5)
+    pairs = [[100 + k, 201 + k] for k in range(count)]
+    ids, found, said = take(pairs)
+    assert ids[0] == [*range(100, 100 + count), 0, 1, 2, 3]
+    assert ids[1] == [*range(201, 201 + count), 11, 12, 13, 14]
+    assert f"{count} given" in said and f'"given": {count}' in found.to_json()
+    alone = ([[p[0] for p in pairs], [p[1] for p in pairs]], None)
+    assert take(pairs, "proposal.complete=false")[:2] == alone
+    assert take(pairs, domain=DISC)[:2] == alone
+
+
+def test_unsure_ones_complete_fewer_than_four_only(monkeypatch):
+    answers(monkeypatch, 0.01)
+    pairs = [[100 + k, 201 + k] for k in range(4)]
+    ids, found, said = take(pairs)
+    assert (len(ids[0]), found) == (4, None) and "NOT SURE" in said
+    ids, _, said = take(pairs[:3])
+    assert len(ids[0]) == 7 and "WARNING" in said
+    assert len(take(pairs, "proposal.alternative=1")[0][0]) == 8  # who asks for it has it
+    assert len(take([*pairs, [300, 300]])[0][0]) == 5  # five are complete
+
+
+PLACES = [[[0, 0.2, 0.3, 0.5], [7, 0.5, 0.5, 0.0]], [[4, 0.1, 0.1, 0.8], [9, 0.0, 1.0, 0.0]]]
+
+
+@pytest.mark.parametrize("domain", [ORBIFOLD, DISC])
+def test_places_in_triangles_are_kept_as_they_are(domain):
+    given = {"source": PLACES[0], "target": PLACES[1]}
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    files = [Mesh(name, np.array(ball.vertices), np.array(ball.faces)) for name in "ab"]
+    console, config = Console(quiet=True), compose_config(["task=pair_map"])
+    config.proposal.complete = False
+    shapes, ids, _ = given_or_proposed(given, files, domain, config, console)
+    for file, shape, of_one, places in zip(files, shapes, ids, PLACES, strict=True):
+        wanted = [np.array(w) @ file.vertices[file.faces[int(f)]] for f, *w in places]
+        assert np.allclose(shape.vertices[of_one], wanted)
+        assert np.array_equal(shape.vertices[: len(file.vertices)], file.vertices)
+        surface = Surface.load((shape.vertices, shape.faces), domain=domain)
+        found = surface.at(surface.preimages(of_one.tolist()))
+        assert np.allclose(found / surface.scale + surface.center, wanted, atol=1e-6)
+    _, nearest, _ = given_or_proposed(given, files, domain, config, console, exact=False)
+    for file, of_one, places in zip(files, nearest, PLACES, strict=True):
+        corners = [file.faces[int(f)][np.argmax(w)] for f, *w in places]
+        assert of_one[0] == corners[0] and of_one[1] in file.faces[int(places[1][0])]
+    bad = {"source": [[0, 0.2, 0.3, 0.9]], "target": [[4, 0.1, 0.1, 0.8]]}
+    with pytest.raises(NsmError) as refused:
+        given_or_proposed(bad, files, domain, config, console)
+    assert (refused.value.kind, refused.value.key) == ("not_on_surface", "a")
+
+
+def test_places_are_written_as_places(monkeypatch, tmp_path):
+    answers(monkeypatch, 0.5)
+    ids, found, said = take({"source": PLACES[0], "target": [50, 60]})
+    count = len(meshes()[0].vertices)
+    assert ids[0][:2] == [count, count + 1] and "become vertices" in said
+    (tmp_path / "landmarks.json").write_text(found.to_json())
+    source, target = read_pairs(tmp_path / "landmarks.json")
+    assert target == ids[1] and source[:2].tolist() == PLACES[0]
+    faces = meshes()[0].faces
+    for (face, *weights), vertex in zip(source[2:], ids[0][2:], strict=True):
+        assert faces[int(face)][np.argmax(weights)] == vertex and max(weights) == 1
+
+
+def test_landmarks_of_a_collection(monkeypatch, tmp_path):
+    rows = [np.arange(15).reshape(5, 3), np.arange(15).reshape(5, 3)[::-1]]
+    found = CollectionProposal(rows, [1.0, 1.3], 0.3, 0, True)
+    monkeypatch.setattr(proposed_landmarks, "proposed_for_all", lambda *_: found)
+    shapes = [*meshes(), meshes()[0]]
+    ids, proposal, said = take(None, shapes=shapes)
+    assert ids == [[0, 3, 6, 9, 12], [2, 5, 8, 11, 14], [2, 5, 8, 11, 14]]
+    assert "5 proposed, sure" in said
+    (tmp_path / "landmarks.json").write_text(proposal.to_json())
+    assert read_collection(tmp_path / "landmarks.json") == ids
 
 
 def test_shapes_without_a_proposal_are_mapped_without_landmarks_unless_asked(monkeypatch):
@@ -96,12 +183,11 @@ def test_shapes_without_a_proposal_are_mapped_without_landmarks_unless_asked(mon
         raise NsmError("no tips", kind="no_proposal", key="landmarks")
 
     monkeypatch.setattr(proposed_landmarks, "proposed", nothing)
-    console = Console(record=True, width=300)
-    assert propose_landmarks(meshes(), False, 0, False, console) is None
-    assert "no tips" in console.export_text()
-    for strict, asked in ((True, False), (False, True)):
+    ids, found, said = take(None)
+    assert (ids, found) == ([[], []], None) and "no tips" in said
+    for landmarks, words in (("auto", []), (None, ["proposal.strict=true"])):
         with pytest.raises(NsmError):
-            propose_landmarks(meshes(), strict, 0, asked, Console(quiet=True))
+            take(landmarks, *words)
 
 
 def test_a_proposal_is_for_the_part_that_is_kept(monkeypatch):
@@ -112,11 +198,10 @@ def test_a_proposal_is_for_the_part_that_is_kept(monkeypatch):
         np.concatenate([faces, faces + len(vertices)]),
     )
     shapes = [meshes()[0], Mesh("both", *both)]
-    console = Console(quiet=True)
     with pytest.raises(NsmError) as refused:
-        propose_landmarks(shapes, False, 0, True, console)
+        take("auto", shapes=shapes)
     assert refused.value.kind == "disconnected"
-    assert propose_landmarks(shapes, False, 0, True, console, Repairs("largest")) is not None
+    assert take("auto", "surface.parts=largest", shapes=shapes)[1] is not None
 
 
 def test_the_command_trains_with_them_and_leaves_the_file(here, tmp_path, monkeypatch):

@@ -171,6 +171,8 @@ def test_the_command_begins_with_a_file_and_ends_without_an_error(
         ["a.obj", "b.obj", "--landmarks", "there.json", "--out", "new.json", "--port", "http"],
         ["a.obj", "b.obj", "--landmarks", "names.json"],
         ["a.obj", "b.obj", "--landmarks", "large.json"],
+        ["a.obj", "b.obj", "--parts", "big"],
+        ["a.obj", "b.obj", "--parts", "9"],
     ],
 )
 def test_wrong_words_are_one_line_and_status_2(here, tmp_path, meshes, words):
@@ -180,3 +182,27 @@ def test_wrong_words_are_one_line_and_status_2(here, tmp_path, meshes, words):
     (tmp_path / "large.json").write_text('{"source": [1], "target": [99999]}')
     run = here("landmarks", *words)
     assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
+
+
+def test_the_command_edits_the_part_that_is_chosen(here, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="needs nsm[view]")
+    import nsm.results.view as view
+
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    small = ball.copy()
+    small.apply_scale(0.6)
+    small.apply_translation([3, 0, 0])
+    trimesh.util.concatenate([small, ball]).export(tmp_path / "both.obj")
+    made = []
+
+    def stop(shapes, *_):
+        made.extend(shapes)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "LandmarkEditor", stop)
+    words = ["landmarks", "both.obj", "both.obj", "--empty", "--port", "0"]
+    assert here(*words).returncode == 2  # a decision is needed
+    for part, first in (("largest", len(small.vertices)), ("1", 0)):
+        made.clear()
+        assert here(*words, "--parts", part).returncode == 130
+        assert [shape.numbers.min() for shape in made] == [first] * 2

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import io
 import json
 import time
 import urllib.request
@@ -9,13 +10,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from tensorboard import program
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_accumulator import (
+    HISTOGRAMS,
+    IMAGES,
+    TENSORS,
+    EventAccumulator,
+)
+from tensorboard.util import tensor_util
 
 import nsm
 from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline import Given, run_task
+from nsm.results.metrics import evaluate
 
 QUICK = ["experiment=quick", "data.held_out=512", "trainer.log_every=5", "trainer.progress=false"]
 TINY = [
@@ -25,6 +34,8 @@ TINY = [
     "data.steps_per_epoch=10",
     "trainer.max_steps=20",
 ]
+
+ACTIVATIONS = {0.001: "softplus", 0.002: "softplus_paper"}  # one class, with two parameters
 
 
 def overfitted(folder: Path, *words: str):
@@ -36,14 +47,16 @@ def overfitted(folder: Path, *words: str):
 def runs(tmp_path_factory):
     """Two runs of one sweep, with all logs on the disk."""
     folder = tmp_path_factory.mktemp("runs")
-    words = ["logger=both", "trainer.log_pictures=1", "sampler.vertex_share=0"]
-    for rate in (0.001, 0.002):
-        overfitted(folder / str(rate), f"optimizer.lr={rate}", *words)
+    words = ["logger=both", "sampler.vertex_share=0"]
+    words += ["trainer.log_pictures=3", "trainer.log_meshes=2", "trainer.log_histograms=2"]
+    for rate, activation in ACTIVATIONS.items():
+        own = [f"optimizer.lr={rate}", f"activation={activation}"]
+        overfitted(folder / str(rate), *own, *words)
     return folder
 
 
 def events(folder: Path) -> EventAccumulator:
-    return EventAccumulator(str(folder)).Reload()
+    return EventAccumulator(str(folder), {TENSORS: 0, IMAGES: 0, HISTOGRAMS: 0}).Reload()
 
 
 def test_weighted_terms_add_up_to_the_loss(runs):
@@ -86,13 +99,68 @@ def test_tensorboard_compares_runs_by_their_final_figures(runs):
         assert time.monotonic() < deadline
         time.sleep(0.2)
     groups = ask("session_groups", allowedStatuses=["STATUS_SUCCESS"], sliceSize=10)
-    assert {m["name"]["tag"].split("/")[0] for m in found["metricInfos"]} == {"figures"}
+    # what the page shows first: settings that differ, by their options' names, and figures
+    assert {one["name"] for one in found["hparamInfos"] if one.get("differs")} == {
+        "activation",
+        "activation.beta",
+        "optimizer.lr",
+    }
+    of_figures = [m["name"]["tag"].startswith("figures/") for m in found["metricInfos"]]
+    assert of_figures == sorted(of_figures, reverse=True) and any(of_figures)
     rows = {group["hparams"]["optimizer.lr"]: group for group in groups["sessionGroups"]}
     assert set(rows) == {0.001, 0.002}
     for rate, group in rows.items():
         stored = json.loads((runs / str(rate) / "metrics.json").read_text())["metrics"]
         shown = {v["name"]["tag"]: v["value"] for v in group["metricValues"]}
         assert shown["figures/rms_percent"] == pytest.approx(stored["rms_percent"], rel=1e-5)
+        assert group["hparams"]["activation"] == ACTIVATIONS[rate]
+
+
+def test_each_job_is_one_run_without_a_curve_of_epochs(runs):
+    places = {file.parent for file in runs.rglob("events.out.tfevents.*")}
+    assert places == {runs / str(rate) / "tensorboard" for rate in ACTIVATIONS}
+    for place in places:
+        assert "epoch" not in events(place).Tags()["scalars"]
+
+
+def test_pictures_are_those_of_the_start_and_of_the_end_and_between(runs):
+    board = events(runs / "0.001" / "tensorboard")
+    (tag,) = board.Tags()["images"]
+    assert [event.step for event in board.Images(tag)] == [0, 10, 20]
+    pictures = [
+        np.asarray(Image.open(io.BytesIO(one.encoded_image_string))) for one in board.Images(tag)
+    ]
+    assert all(one.shape == (384, 384, 3) for one in pictures)
+    assert (pictures[0] != pictures[2]).any()
+
+
+def test_meshes_are_those_of_the_surface_as_it_learns(runs):
+    board = events(runs / "0.001" / "tensorboard")
+    tags = {tag.split("_")[-1]: tag for tag in board.Tags()["tensors"] if "_hparams_" not in tag}
+
+    def parts(tag):
+        found = board.Tensors(tags[tag])
+        assert [event.step for event in found] == [0, 20]
+        return [tensor_util.make_ndarray(event.tensor_proto)[0] for event in found]
+
+    phi = nsm.load(runs / "0.001")
+    start, end = parts("VERTEX")
+    np.testing.assert_allclose(end, evaluate(phi.map, phi.surface.uv), atol=1e-6)
+    assert np.abs(start - end).max() > 1e-4
+    np.testing.assert_array_equal(parts("FACE")[0], phi.surface.faces)
+    assert parts("COLOR")[0].max() <= 255 and np.ptp(parts("COLOR")[0], axis=0).max() > 200
+
+
+def test_histograms_count_every_weight(runs):
+    board = events(runs / "0.001" / "tensorboard")
+    network = nsm.load(runs / "0.001").map
+    weights = {f"weights/map.{name}": one.numel() for name, one in network.named_parameters()}
+    assert weights.keys() <= set(board.Tags()["histograms"])
+    for tag, count in weights.items():
+        found = board.Histograms(tag)
+        assert [(one.step, one.histogram_value.num) for one in found] == [(0, count), (20, count)]
+        gradients = board.Histograms(tag.replace("weights", "gradients"))
+        assert [one.step for one in gradients] == [1, 20]  # none before the first step
 
 
 def test_a_resumed_run_goes_on_in_the_same_logs(tmp_path):

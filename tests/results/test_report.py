@@ -1,6 +1,7 @@
 """The report: its content compared with the runs, and the page in a browser."""
 
 import base64
+import csv
 import gzip
 import io
 import json
@@ -9,6 +10,7 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,11 @@ from nsm.config import compose_config
 from nsm.errors import NsmError
 from nsm.pipeline import run
 from nsm.results import load_surface
+from nsm.results.metrics import evaluate
 from nsm.results.report import write_report
+from nsm.results.report.labels import labels, over_seeds
+from nsm.results.report.runs import find_runs
+from nsm.results.report.sweep import write_sweep
 
 TINY = [
     "surface=hemisphere",
@@ -83,7 +89,10 @@ def unpacked(content: dict, index: int) -> np.ndarray:
 def test_figures_and_settings_are_those_of_the_runs(runs, page):
     overfit = task(page, "overfit")
     assert overfit["differing"][0] == "activation"
-    assert {one["label"] for one in overfit["runs"]} >= {"activation=SiLU", "activation=ReLU"}
+    assert {one["label"] for one in overfit["runs"]} >= {
+        "hemisphere, activation=silu",
+        "hemisphere, activation=relu",
+    }
     for one in overfit["runs"]:
         stored = json.loads((runs / one["name"] / "metrics.json").read_text())
         assert one["figures"].items() >= stored["metrics"].items()
@@ -141,7 +150,7 @@ def test_histograms_are_the_distortion_of_the_triangles(runs, page):
     overfit = task(page, "overfit")
     number = [one["name"] for one in overfit["runs"]].index("sweep/1")
     phi = load_surface(runs / "sweep" / "1")
-    image, values, areas = phi(phi.surface.uv), [], []
+    image, values, areas = evaluate(phi.map, phi.surface.uv), [], []
     for corners in phi.surface.faces:
         x, y = phi.surface.vertices[corners], image[corners]
         e, g = np.stack([x[1] - x[0], x[2] - x[0]], 1), np.stack([y[1] - y[0], y[2] - y[0]], 1)
@@ -165,7 +174,7 @@ def test_shapes_are_those_of_the_runs_and_shared_arrays_are_stored_once(runs, pa
         phi = load_surface(runs / one["name"])
         shape = one["shapes"][0]
         vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
-        assert np.allclose(vertices, phi(phi.surface.uv), atol=1e-5)
+        assert np.allclose(vertices, evaluate(phi.map, phi.surface.uv), atol=1e-5)
         assert np.array_equal(unpacked(shown, shape["faces"]).reshape(-1, 3), phi.surface.faces)
     assert len({one["shapes"][0]["faces"] for one in overfit["runs"]}) == 1
     mapped = next(one for one in shown["tasks"] if one["name"] == "pair_map")["runs"][0]
@@ -202,7 +211,7 @@ def test_a_fine_mesh_is_decimated_for_the_page(runs, monkeypatch, tmp_path):
     vertices = unpacked(shown, shape["vertices"]).reshape(-1, 3)
     faces = unpacked(shown, shape["faces"]).reshape(-1, 3)
     assert 50 < len(faces) <= 100 < len(phi.surface.faces)
-    known = phi(phi.surface.uv)
+    known = evaluate(phi.map, phi.surface.uv)
     assert all(np.abs(known - vertex).max(axis=1).min() < 1e-5 for vertex in vertices[::7])
     for colour in shape["colours"].values():
         count = len(faces) if colour["of"] == "faces" else len(vertices)
@@ -263,10 +272,76 @@ def test_settings_are_named_by_their_group(runs, tmp_path):
     shown = task(tmp_path / "report.html", "overfit")
     assert shown["differing"] == ["activation", "activation.beta"]
     assert [one["label"] for one in shown["runs"]] == [
-        "activation=Softplus",
-        "activation=mine.Bump",
+        "hemisphere, activation=softplus",
+        "hemisphere, activation=mine.Bump",
     ]
     assert shown["runs"][0]["settings"]["optimizer.lr"] == 0.1
+
+
+def written(folder: Path, **settings: Any) -> None:
+    """A run of hand-made settings and figures."""
+    figures = settings.pop("figures")
+    folder.mkdir(parents=True)
+    config = {"task": {"_target_": "nsm.pipeline.overfit.OverfitTask", "name": "overfit"}}
+    (folder / "config.yaml").write_text(json.dumps(config | settings))
+    (folder / "metrics.json").write_text(json.dumps(figures))
+
+
+def test_figures_over_seeds_are_means_and_deviations(tmp_path):
+    for width in (32, 64):
+        for seed in (0, 1, 2):
+            error = {32: [1.0, 2.0, 4.5], 64: [3.0, 3.0, 3.0]}[width][seed]
+            figures = {"surface": "cow", "metrics": {"rms_percent": error, "certified": True}}
+            written(tmp_path / f"{width}-{seed}", map={"width": width}, seed=seed, figures=figures)
+    written(tmp_path / "alone", map={"width": 8}, seed=0, figures=figures)
+    runs, _ = find_runs([tmp_path])
+    few, many = over_seeds(runs)
+    assert (few.label, many.label) == ("cow, width=32", "cow, width=64")
+    assert [runs[n].settings["map.width"] for n in few.runs] == [32, 32, 32]
+    assert few.figures == {"rms_percent": pytest.approx((2.5, np.sqrt(3.25)))}
+    assert many.figures == {"rms_percent": (3.0, 0.0)}
+
+
+def test_runs_are_named_by_what_they_are_of(tmp_path):
+    kinds = {
+        "a": {"surface": "cat", "target": "horse"},
+        "b": {"surface": "cat", "surfaces": list("uvwxyz")},
+        "c": {"surface": "cow"},
+        "d": {"surface": "cow"},
+    }
+    for name, kind in kinds.items():
+        written(tmp_path / name, figures={**kind, "metrics": {"rms_percent": 1.0}})
+    runs, _ = find_runs([tmp_path])
+    assert labels(runs) == ["cat → horse", "u, v, w, x, 2 more", "cow (c)", "cow (d)"]
+
+
+def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_path):
+    sweep = tmp_path / "sweep-activation"
+    for name in ("1", HOSTILE):
+        shutil.copytree(runs / "sweep" / name, sweep / str(len(name)))
+    table = write_sweep(sweep)
+    names = ["hemisphere, activation=relu", "hemisphere, activation=silu"]
+    assert list(table.columns[0].cells) == names
+    with (sweep / "sweep.csv").open() as stream:
+        rows = {row["job"]: row for row in csv.DictReader(stream)}
+    assert set(rows) == set(names)
+    for row in rows.values():
+        stored = json.loads((sweep / row["folder"] / "metrics.json").read_text())["metrics"]
+        assert float(row["rms_percent"]) == stored["rms_percent"]
+    picture = np.asarray(Image.open(sweep / "sweep.png").convert("RGB"), dtype=float)
+    assert np.ptp(picture, axis=2).max() > 100  # colours of normals
+    write_report([sweep], tmp_path / "report.html")
+    (shown,) = content(tmp_path / "report.html")["sweeps"]
+    assert shown["name"] == "sweep-activation"
+    data = base64.b64decode(shown["picture"].split(",")[1])
+    assert Image.open(io.BytesIO(data)).width >= 900
+
+
+def test_a_view_is_upright_for_any_axis(page):
+    for axis, frame in task(page, "overfit")["runs"][0]["shapes"][0]["frames"].items():
+        sign = -1 if axis[0] == "-" else 1
+        assert sign * frame["up"]["xyz".index(axis[-1])] > 0.5
+        assert np.dot(frame["up"], frame["towards"]) == pytest.approx(0, abs=1e-4)
 
 
 def test_the_command_writes_the_page_and_prints_its_path(runs, tmp_path, here):
@@ -376,13 +451,13 @@ def test_the_table_sorts_and_filters(browser):
     rising = names(browser)
     click(browser, key)
     assert names(browser) == rising[::-1]
-    assert set(rising) == {"activation=SiLU", "activation=ReLU"}
+    assert set(rising) == {"hemisphere, activation=silu", "hemisphere, activation=relu"}
     click(browser, key)
     type_into(browser, "thead input[aria-label='filter activation']", "RELU")
-    assert names(browser) == ["activation=ReLU"]
+    assert names(browser) == ["hemisphere, activation=relu"]
     # filters apply to the plots as well
     plotted = "return document.querySelector('#curves .plot').data.map(x => x.name)"
-    assert browser.execute_script(plotted) == ["activation=ReLU"]
+    assert browser.execute_script(plotted) == ["hemisphere, activation=relu"]
     type_into(browser, "thead input[aria-label='filter activation']", "")
     type_into(browser, "thead input[aria-label='filter RMS distance']", "< 0")
     assert names(browser) == []
@@ -393,6 +468,21 @@ def test_the_table_sorts_and_filters(browser):
     assert len(browser.execute_script(plotted)) == 1
     click(browser, "#table tbody input[type=checkbox]")
     assert len(browser.execute_script(plotted)) == 2
+
+
+def test_the_first_curve_is_of_held_out_points_and_has_several(browser):
+    chosen = browser.execute_script("return document.querySelector('#curves select').value")
+    assert chosen == "val/rms_percent"
+    counts = "return document.querySelector('#curves .plot').data.map(x => x.x.length)"
+    assert browser.execute_script(counts) == [2, 2]
+
+
+def test_a_picture_is_large_on_a_click(browser):
+    click(browser, "#pictures img")
+    assert browser.execute_script("return document.querySelector('#large').open")
+    width = "return document.querySelector('#large img').getBoundingClientRect().width"
+    assert browser.execute_script(width) > 1200
+    click(browser, "#large")
 
 
 def test_views_show_shapes_and_rotate_together(browser):

@@ -33,8 +33,14 @@ from nsm.results import (
     reconstruction_image,
     save_surface,
 )
+from nsm.results.collection_pictures import cycle_picture
+from nsm.results.evolution import extend_strip
 from nsm.results.files import as_json
+from nsm.results.pair_pictures import normals_picture
+from nsm.results.pictures import neural_normals
 from nsm.results.render import View, rasterise, vertex_normals
+from nsm.results.spheres import Spheres
+from nsm.surfaces.shapes import ring_mesh
 
 
 class Affine(nn.Module):
@@ -350,3 +356,46 @@ def test_a_texture_does_not_take_the_name_of_another_picture(neural, tmp_path):
     export_mesh(tmp_path / "shape.OBJ", *neural.to_mesh(), texture=checkerboard(64))
     assert (tmp_path / "shape.png").read_bytes() == b"mine"
     assert "shape_texture.png" in (tmp_path / "shape.mtl").read_text()
+
+
+def test_a_strip_has_the_pictures_in_their_places(tmp_path):
+    file = tmp_path / "strip.png"
+    pictures = [np.full((4, 6, 3), 40 * k, dtype=np.uint8) for k in range(4)]
+    for k in (0, 1, 2, 1, 2, 3):  # interrupted after the third, resumed from before the second
+        extend_strip(file, pictures[k], k)
+    assert np.array_equal(np.asarray(Image.open(file)), np.concatenate(pictures, axis=1))
+
+
+def test_landmarks_are_spheres_of_their_own_colours_in_a_picture():
+    uv, faces = ring_mesh(8)
+    vertices = np.column_stack([uv, np.zeros(len(uv))])
+    at = np.array([0, len(uv) - 1])
+    spheres, view = Spheres(vertices, faces, at), View(vertices, 128, frame=np.eye(3))
+
+    def paint(blend):
+        return blend(np.full((len(uv), 3), 0.5))
+
+    drawn = view.draw(*spheres.mesh, spheres.painted(paint))
+    coloured = np.ptp(drawn, axis=2) > 0.2
+    assert 0 < coloured.mean() < 0.05
+    centre = drawn[63, 63]
+    assert centre[0] > 1.5 * centre[1:].max()  # hsv begins with red
+    red = (drawn[:, :, 0] > drawn[:, :, 2]) & coloured
+    other = (drawn[:, :, 0] < drawn[:, :, 2]) & coloured  # and has cyan in its middle
+    assert red.sum() > 5 and other.sum() > 5
+
+
+def test_the_normals_of_a_network_are_those_of_its_surface():
+    phi = Affine([1, 0, 0], [0, 0, 1], [0, 0, 0])
+    assert np.allclose(neural_normals(phi, np.zeros((3, 2))), [0, -1, 0])
+    flat = Affine([1, 0, 0], [1, 0, 0], [0, 0, 0])
+    assert np.allclose(neural_normals(flat, np.zeros((1, 2))), 0)
+
+
+def test_pictures_of_normals_and_of_a_cycle_are_drawn(tmp_path):
+    made = results(6)
+    normals_picture(tmp_path / "normals.png", made.pair)
+    cycle_picture(tmp_path / "cycle.png", made.trio)
+    for name in ("normals.png", "cycle.png"):
+        picture = np.asarray(Image.open(tmp_path / name).convert("RGB"), dtype=float)
+        assert picture.std() > 20  # something is on it

@@ -5,21 +5,20 @@ from types import SimpleNamespace
 import pytest
 from torch import nn, optim, zeros
 
-from nsm.config import compose_config
-from nsm.pipeline.training import _stop_norm
 from nsm.results.callbacks import GradientWatch
 from nsm.tasks.schedules import build_scheduler
 
 
-def stopped(norms, schedule, threshold=1.0, window=3):
+def stopped(norms, schedule, threshold=1.0, window=3, batch=None, **options):
     """The step after which a training with gradients of these norms stops, or None."""
     weight = nn.Parameter(zeros(1))
     settings = {"_target_": f"nsm.tasks.schedules.{schedule['name']}", **schedule["settings"]}
     scheduler = build_scheduler(optim.SGD([weight], lr=1.0), settings, len(norms))
-    watch = GradientWatch(10**6, threshold, window)
+    watch = GradientWatch(10**6, threshold, window, **options)
     trainer = SimpleNamespace(
         global_step=0,
         should_stop=False,
+        world_size=1,
         lr_scheduler_configs=[SimpleNamespace(scheduler=scheduler)],
     )
     for step, norm in enumerate(norms):
@@ -27,7 +26,7 @@ def stopped(norms, schedule, threshold=1.0, window=3):
         weight.grad = zeros(1) + norm
         watch.on_before_optimizer_step(trainer, nn.ParameterList([weight]), None)
         trainer.global_step = step + 1
-        watch.on_train_batch_end(trainer, None, None, None, 0)
+        watch.on_train_batch_end(trainer, None, None, batch, 0)
         if trainer.should_stop:
             return step + 1
     return None
@@ -47,9 +46,8 @@ def test_warm_restarts_stop_where_a_wave_ends():
     assert stopped([2.0] * 30, WAVES) is None
 
 
-@pytest.mark.parametrize(("of", "expected"), [("mean", 0.1), ("sum", 0.1 / 50)])
-def test_the_norm_of_a_sum_is_that_of_the_mean_times_the_batch(of, expected):
-    config = compose_config(
-        ["trainer.stop_gradient_norm=0.1", f"trainer.stop_norm_of={of}", "data.batch_size=50"]
-    )
-    assert _stop_norm(config) == pytest.approx(expected)
+@pytest.mark.parametrize("batch", [zeros(50, 2), (zeros(50, 2), zeros(50, 3))])
+def test_the_norm_of_a_sum_is_that_of_the_mean_times_the_samples(batch):
+    falling = [0.5, 0.1, 0.03, 0.019, 0.019, 0.019]
+    assert stopped(falling, CONSTANT, window=1, batch=batch, summed=True) == 4  # 50 · 0.019 < 1
+    assert stopped(falling, CONSTANT, window=1, batch=batch) == 1

@@ -24,9 +24,11 @@ from nsm.results import (
     save_surface,
 )
 from nsm.results.analytic import analytic_surface
+from nsm.results.render import UP_AXES
+from nsm.results.view.colours import as_lab, distinct_colours
 from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import hit, pick, pick_at
-from nsm.results.view.scene import PLAIN, POSITION, UP_AXES, Paint, scene_of
+from nsm.results.view.scene import PLAIN, POSITION, Paint, scene_of
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.shapes import ring_mesh
 from nsm.surfaces.topology import boundary_loops
@@ -296,7 +298,7 @@ def test_a_click_marks_the_point_and_its_image(served, f):
     with urllib.request.urlopen(address, timeout=20) as page:
         assert page.status == 200 and b"<html" in page.read().lower()
     click(viewer, 0)
-    source, target = (np.array(marker.position) for marker in viewer.markers["red"])
+    source, target = (np.array(marker.position) for marker in viewer.markers[1])
     s, t = f.source.surface, f.target.surface
     point = source - viewer.scene.offsets[0] - (viewer.scene.source.vertices - s.vertices)[0]
     image = f(point[None] / s.scale + s.center)
@@ -307,16 +309,24 @@ def test_a_click_marks_the_point_and_its_image(served, f):
     # the source moves under its marker
     viewer.morph.value = 1.0
     viewer._show_morph()
-    at = viewer.picks["red"].places[0].take(viewer.scene.image, s.faces)[0]
-    assert np.array(viewer.markers["red"][0].position) == pytest.approx(
+    at = viewer.picks[1].places[0].take(viewer.scene.image, s.faces)[0]
+    assert np.array(viewer.markers[1][0].position) == pytest.approx(
         at + viewer.scene.offsets[0], abs=1e-6
     )
     viewer.morph.value = 0.0
     viewer._show_morph()
     for _ in range(5):
         click(viewer, 1)
-    assert list(viewer.markers) == ["blue", "green", "purple", "orange", "red"]
-    assert viewer._list.content.startswith("**red**")
+    assert list(viewer.markers) == [2, 3, 4, 5, 6]
+    latest = viewer._list.content.split("\n\n")[0].splitlines()
+    assert latest[0].startswith("**6** | vertex") and latest[2].startswith("sphere\\_cap |")
+    assert latest[3].startswith("cone (picked)".replace("cone", t.name))
+    for side, line in enumerate(latest[2:4]):
+        number, corner = int(line.split("|")[1]), viewer.picks[6].coordinates[side]
+        mesh = (s, t)[side]
+        vertices = mesh.vertices[mesh.cut_vertex] / mesh.scale + mesh.center
+        near = np.sort(np.linalg.norm(vertices - corner, axis=1))
+        assert np.linalg.norm(vertices[number] - corner) <= near[2] + 1e-9
     viewer._clear_picks()
     assert viewer.markers == {} and viewer._list.content == ""
     viewer.on_click(SimpleNamespace(ray_origin=(0, 0, 99.0), ray_direction=(0, 0, 1.0)))
@@ -363,7 +373,7 @@ def test_any_pair_of_a_collection_is_chosen(surfaces):
         assert [s.name for s in viewer.scene.shapes] == ["sphere_cap", "cone"]
         assert viewer.picks == {}
         click(viewer, 0)
-        found = viewer.picks["red"]
+        found = viewer.picks[1]
         assert group.pair(0, 2)(found.coordinates[0][None])[0] == pytest.approx(
             found.coordinates[1], abs=1e-9
         )
@@ -451,3 +461,20 @@ def test_the_page_cannot_publish_the_server(served):
     started = time.monotonic()
     assert viewer.server.request_share_url() is None
     assert time.monotonic() - started < 1
+
+
+def test_colours_of_landmarks_are_told_apart():
+    few, many = distinct_colours(8), distinct_colours(24)
+    assert (many[:8] == few).all()  # a further landmark changes no other's colour
+    lab = as_lab(many / 255)
+    apart = np.linalg.norm(lab[:, None] - lab[None], axis=-1)[~np.eye(24, dtype=bool)]
+    assert apart.min() > 20  # ten times what is just noticed
+    white, red = as_lab(np.array([[1.0, 1, 1], [1, 0, 0]]))
+    assert white == pytest.approx([100, 0, 0], abs=0.02)
+    assert red == pytest.approx([53.24, 80.09, 67.20], abs=0.02)  # tabulated
+
+
+def test_names_of_files_stay_text_in_the_panel():
+    from nsm.results.view.server import _cell
+
+    assert _cell("cat|<b>*x*") == r"cat\|\<b\>\*x\*"

@@ -16,7 +16,8 @@ from thorough import examples
 
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
-from nsm.pipeline.resolve_inputs import landmark_vertices, read_shape
+from nsm.pipeline.landmark_inputs import landmark_vertices
+from nsm.pipeline.resolve_inputs import read_shape
 from nsm.surfaces import catalogue
 from nsm.surfaces.landmark_files import (
     read_collection,

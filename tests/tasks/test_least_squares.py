@@ -70,13 +70,13 @@ def test_a_spline_of_the_grid_is_found_again(monkeypatch):
         for table in grid.tables:
             table.normal_()
         uv = 2 * torch.rand(4000, 2) - 1
-        along = torch.eye(2, dtype=torch.float64).expand(len(uv), 2, 2)
+        along = torch.eye(2, dtype=torch.float64)[..., None].expand(2, 2, len(uv))
 
         def spline(stack):  # each level adds to the same three coordinates
             return stack[:, :, 2:5] + stack[:, :, 5:8]
 
         target = spline(value_and_jacobian_stack(grid, uv)).double()
-        _fit_tables(found, linear_skip, uv, along, target)
+        _fit_tables(found, linear_skip, uv, along, target.transpose(1, 2))
         stack = value_and_jacobian_stack(found, uv) @ linear_skip.weight.t()
         stack[0] += linear_skip.bias
     torch.testing.assert_close(stack, target.float(), rtol=0, atol=5e-3)

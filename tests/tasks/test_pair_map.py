@@ -1,12 +1,14 @@
 """PairMap and CollectionMap: known maps are found, constraints hold, runs resume."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
 
 from nsm.data import Samples
 from nsm.domains import Disc
-from nsm.energies import SymmetricDirichlet
+from nsm.energies import SymmetricDirichlet, first_fundamental_form, symmetric_dirichlet
 from nsm.maps import Rotated, build_analytic
 from nsm.surfaces.shapes import ring_mesh
 from nsm.tasks import CollectionMap, PairMap
@@ -43,6 +45,7 @@ MESH = (torch.as_tensor(_POINTS, dtype=torch.float32), torch.as_tensor(_FACES))
 def settings(changes):
     """The settings with changes: of the constraints, of the weights, or of the rest."""
     constraints = {key: changes.pop(key, value) for key, value in CONSTRAINTS.items()}
+    constraints |= {key: changes.pop(key) for key in ("pairs",) if key in changes}
     weights = {**WEIGHTS, **changes.pop("weights", {})}
     return {**SETTINGS, "loss_weights": weights, "constraints": constraints, **changes}
 
@@ -267,8 +270,6 @@ def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
     area = torch.linalg.det((j := cap.value_and_jacobian(x)[1]).transpose(1, 2) @ j).sqrt()
     # samples are uniform on the plane: back counts by the cap's area
     with torch.no_grad():
-        from nsm.energies import first_fundamental_form, symmetric_dirichlet
-
         a = first_fundamental_form(cap.value_and_jacobian(x)[1])
         b = first_fundamental_form(surface("plane").value_and_jacobian(x)[1])
         back = (area * symmetric_dirichlet(a, b)).sum() / area.sum()
@@ -282,6 +283,24 @@ def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
     )
     assert forth.mean.item() == pytest.approx(forth_weighted.item(), rel=0.05)
     assert back.item() == pytest.approx(back_weighted.item(), rel=0.05)
+
+
+def test_the_paper_sums_over_all_ordered_pairs():
+    names, x = ["plane", "saddle", "sphere_cap"], samples(512)
+    points, targets = torch.tensor([[0.2, 0.1]]), torch.tensor([[[0.3, 0.1]]] * 3)
+    given = {"points": points, "targets": targets, "landmarks": "fixed"}
+    losses = {
+        of: collection(names, **given, pairs=of).training_step(x, 0) for of in ("sum", "mean")
+    }
+    metrics = [first_fundamental_form(surface(n).value_and_jacobian(x)[1]) for n in names]
+    area = torch.stack([torch.linalg.det(a).sqrt() for a in metrics])
+    total = 0.0  # h is the identity; a pair is weighted by its source's area
+    for i, j in itertools.permutations(range(3), 2):
+        weight = area[i] / area.mean(dim=0)
+        total += (weight * symmetric_dirichlet(metrics[i], metrics[j])).sum() / weight.sum()
+    missed = 10.0 * 3 * 0.1**2  # λ_C Σ‖h(P) - Q‖² of three surfaces
+    assert losses["sum"].item() == pytest.approx(float(total) + missed, rel=1e-5)
+    assert losses["mean"].item() == pytest.approx(float(total) / 6 + 4 / 3 * missed, rel=1e-5)
 
 
 def test_a_collection_meets_its_landmarks_on_every_surface():

@@ -116,7 +116,11 @@ def test_planar_figures_of_known_maps():
     assert same["symmetric_dirichlet_median"] == pytest.approx(2 + 2 / 1.01)
     assert same["flipped_percent"] == 0
     assert same["boundary_self_intersections"] == 0
+    assert same["conformal_median"] == pytest.approx(0, abs=1e-9)
     stretched = planar_metrics(vertices, faces, flat * [3.0, 1.0])
+    # Eq. 3 at σ = 3 and 1: ‖(10/82) diag(9, 1) - I‖²
+    expected = (10 * 9 / 82 - 1) ** 2 + (10 / 82 - 1) ** 2
+    assert stretched["conformal_median"] == pytest.approx(expected)
     assert stretched["singular_value_ratio_p95"] == pytest.approx(3)
     assert stretched["area_mean"] == pytest.approx(4 + 4 / 9)
     folded = flat.copy()

@@ -7,6 +7,7 @@
 | ``lifts`` | which lift of its vertex each corner belongs to; ``group``: the symmetry group |
 | ``tutte``, ``newton``, ``sweeps``, ``collapses``, ``multiresolution`` | the layout: Tutte on a handful of triangles, then descent while the rest is put back |
 | ``certificate`` | whether a map to R²/Γ is a homeomorphism, exactly |
+| ``alignment``, ``collection_alignment`` | likely isotopy classes of maps between surfaces, best first |
 | ``cover`` | nearest lifts of points, and their places on the mesh |
 | ``repair`` | maps of a surface's copies of vertices made exact, and their flips turned back |
 | ``maps`` | periodic, even and equivariant maps in torch |

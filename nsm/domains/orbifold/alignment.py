@@ -10,7 +10,6 @@ Primer on Mapping Class Groups", sections 2.2.4 and 2.2.5).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -66,6 +65,10 @@ class Alignment:
         """B x + c at points (N, 2) of Ω."""
         return points @ self.matrix.T + self.shift
 
+    def then(self, other: Alignment) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and shift of this map followed by another."""
+        return other.matrix @ self.matrix, other(self.shift[None])[0]
+
     @property
     def inverse(self) -> Alignment:
         """The map back, x ↦ B⁻¹(x - c), with the same figures."""
@@ -106,11 +109,8 @@ def alignments(
             kind="wrong_domain",
             key=target.name,
         )
-    if landmarks is None:
-        p = q = np.zeros((0, 2))
-    else:
-        p, q = (s.preimages(i.tolist()) for s, i in zip((source, target), landmarks, strict=True))
-    pair = _Pair(source, target, p, q)
+    pair = Judge(source, target, landmarks)
+    p, q = pair.p, pair.q
     found = _candidates(source, target)
     if domain.even:
         cone = np.logical_and(*((x == np.rint(x)).all(axis=1) for x in (p, q)))
@@ -125,32 +125,8 @@ def alignments(
     else:
         classes = pair.best_shifts(found[: _CLASSES // 16])
     first = sorted((pair.alignment(b, c, _FEW) for b, c in classes), key=lambda a: a.score)
-    best = [pair.alignment(a.matrix, a.shift, _MANY) for a in first[:_FINALISTS]]
+    best = [pair.alignment(a.matrix, a.shift) for a in first[:_FINALISTS]]
     return sorted(best, key=lambda a: a.score)
-
-
-def alignments_to_first(
-    surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray] | None = None
-) -> list[Alignment]:
-    """The best alignment of each surface of a collection to the first; the first's is the identity.
-
-    Args:
-        surfaces: on the same closed domain.
-        landmarks: corresponding vertices (L,) of each mesh file, if any.
-
-    Raises:
-        NsmError: as :func:`alignments`.
-    """
-    first = [Alignment(np.eye(2, dtype=np.int64), np.zeros(2), float(np.log(_least())), 0.0)]
-    for k, surface in enumerate(surfaces[1:], start=1):
-        common = None if landmarks is None else (landmarks[k], landmarks[0])
-        first.append(alignments(surface, surfaces[0], common)[0])
-    return first
-
-
-def _least() -> float:
-    """The energy of an isometry."""
-    return 2 + 2 / (1 + _EPSILON)
 
 
 def _domain(surface: Surface) -> ClosedDomain:
@@ -187,13 +163,21 @@ def _candidates(source: Surface, target: Surface) -> list[np.ndarray]:
     return [bases[1] @ m @ back for m in matrix[order]]
 
 
-class _Pair:
-    """Two surfaces, and what their maps x ↦ B x + c are judged by."""
+class Judge:
+    """Two surfaces, and what their maps x ↦ B x + c are judged by; arguments as for
+    :func:`alignments`."""
 
-    def __init__(self, source: Surface, target: Surface, p: np.ndarray, q: np.ndarray) -> None:
+    def __init__(
+        self, source: Surface, target: Surface, landmarks: Landmarks | None = None
+    ) -> None:
         import igl
 
-        self.source, self.target, self.p, self.q = source, target, p, q
+        self.source, self.target = source, target
+        given = landmarks or (np.zeros(0, dtype=int),) * 2
+        self.p, self.q = (
+            s.preimages(i.tolist()).reshape(-1, 2)
+            for s, i in zip((source, target), given, strict=True)
+        )
         self.even = _domain(source).even
         corners = source.uv[source.faces]
         self.middle = corners.mean(axis=1)
@@ -208,7 +192,7 @@ class _Pair:
         assert target.lattice is not None
         self.shape = target.lattice / SIDE
 
-    def alignment(self, matrix: np.ndarray, shift: np.ndarray, count: int) -> Alignment:
+    def alignment(self, matrix: np.ndarray, shift: np.ndarray, count: int = _MANY) -> Alignment:
         """Judged by about ``count`` of the source's triangles."""
         chosen = np.unique(np.linspace(0, len(self.area) - 1, count).astype(int))
         image = self.middle[chosen] @ matrix.T + shift

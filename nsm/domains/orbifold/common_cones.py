@@ -50,7 +50,8 @@ def choose_common_cones(
         if len(faces) > LARGE:
             coarse, ids = decimated(vertices, faces, LARGE // 2, own[k])
             smaller[k], own[k] = (vertices[ids], coarse), np.searchsorted(ids, own[k])
-    score, four, lattices = compared(smaller, own, sets[:_SETS])[0]
+    # the best differ less than the surfaces' layouts on few and many faces: no second comparison
+    score, four, lattices = compared(smaller, own, sets[:_SETS], again=False)[0]
     return chosen[four[_least_sheared(lattices)]], score
 
 

@@ -138,22 +138,24 @@ def compared(
     meshes: Sequence[tuple[np.ndarray, np.ndarray]],
     candidates: Sequence[np.ndarray],
     sets: Sequence[np.ndarray],
+    again: bool = True,
 ) -> list[tuple[float, np.ndarray, list[np.ndarray]]]:
     """Sets of four candidates, by the mean of the meshes' scores, best first.
 
-    All are laid out on a few hundred faces; those returned, the best, again on about 3,000.
+    All are laid out on a few hundred faces.
 
     Args:
         meshes: (V, 3) and (F, 3) of each.
         candidates: (K,) corresponding vertices of each.
         sets: which candidates (4,) each has.
+        again: lay the two best out again on about 3,000 faces, and return these.
 
     Returns:
         of each set the mean score, the set, and the meshes' lattices (2, 2).
     """
     few, many = (_FEW, _QUICK), (_FACES, _LONGER)
     found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
-    for count, effort in (few, many) if len(sets) > 1 else (few,):
+    for count, effort in (few, many) if again and len(sets) > 1 else (few,):
         each = [
             _scored(*mesh, ids, sets, count, effort)
             for mesh, ids in zip(meshes, candidates, strict=True)

@@ -12,29 +12,41 @@ from nsm.domains.orbifold.repair import isotopy_class
 from nsm.surfaces.location import Places, locate
 
 
-def lifted_near(
+def nearest_lifts(
     points: np.ndarray, near: np.ndarray, symmetric: bool, lattice: np.ndarray | None = None
-) -> np.ndarray:
-    """Of all lifts of points (N, 2) those (N, 2) that are nearest to others (N, 2).
+) -> tuple[np.ndarray, np.ndarray]:
+    """How points (N, 2) are moved to their lifts that are nearest to others (N, 2).
 
     Args:
         points, near: in coordinates of Ω.
         symmetric: whether x and -x are one point: the orbifold.
         lattice: (2, 2) of an embedding, by whose plane distances are measured; of Ω if not given.
+
+    Returns:
+        s (N, 1), which is ±1, and k (N, 2): the lifts are s x + k.
     """
     shape = np.eye(2) if lattice is None else lattice / SIDE
     basis = reduced_basis(shape)  # in another the nearest lift may be far from the rounded one
     back = np.rint(np.linalg.inv(basis))
-    best = np.empty_like(points, dtype=np.float64)
+    signs, shifts = np.ones((len(points), 1)), np.zeros((len(points), 2))
     least = np.full(len(points), np.inf)
     for sign in (1, -1) if symmetric else (1,):
         first = np.rint((near - sign * points) @ back.T / SIDE)
         for shift in product((-1, 0, 1), repeat=2):
-            lift = sign * points + SIDE * ((first + np.array(shift)) @ basis.T)
-            distance = np.linalg.norm((lift - near) @ shape.T, axis=1)
+            by = SIDE * ((first + np.array(shift)) @ basis.T)
+            distance = np.linalg.norm((sign * points + by - near) @ shape.T, axis=1)
             closer = distance < least
-            best[closer], least[closer] = lift[closer], distance[closer]
-    return best
+            signs[closer], shifts[closer], least[closer] = sign, by[closer], distance[closer]
+    return signs, shifts
+
+
+def lifted_near(
+    points: np.ndarray, near: np.ndarray, symmetric: bool, lattice: np.ndarray | None = None
+) -> np.ndarray:
+    """Of all lifts of points (N, 2) those (N, 2) that are nearest to others (N, 2); arguments as
+    for :func:`nearest_lifts`."""
+    sign, shift = nearest_lifts(points, near, symmetric, lattice)
+    return sign * points + shift
 
 
 def triangles_over_domain(

@@ -12,7 +12,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from nsm.domains import planar_mesh
 from nsm.domains.base import Domain
 from nsm.domains.orbifold import group
-from nsm.domains.orbifold.cover import carried, located_on
+from nsm.domains.orbifold.cover import carried, located_on, nearest_lifts
 from nsm.domains.orbifold.embedding import SIDE, Embedding, embed_orbifold, embed_torus
 from nsm.domains.orbifold.quotient_mesh import quotient_mesh
 from nsm.domains.orbifold.repair import copied, repaired, torn
@@ -146,19 +145,16 @@ class ClosedDomain(Domain):
         """As :meth:`Domain.canonical`."""
         return SIDE * group.into_domain(points / SIDE, self.even)[0]
 
-    def lift(self, points: Tensor, near: Tensor) -> Tensor:
-        """The lifts of points (N, 2) nearest to others (N, 2), in coordinates of Ω."""
+    def lift(self, points: Tensor, near: Tensor, lattice: np.ndarray | None = None) -> Tensor:
+        """The lifts of points (N, 2) nearest to others (N, 2), in the plane of a surface's lattice
+        (2, 2); in coordinates of Ω if it is not given."""
         import torch
 
-        lifts = []
-        for sign in (1.0, -1.0) if self.even else (1.0,):
-            first = sign * points + SIDE * torch.round((near - sign * points).detach() / SIDE)
-            lifts += [
-                first + SIDE * points.new_tensor(shift) for shift in product((-1, 0, 1), repeat=2)
-            ]
-        every = torch.stack(lifts)
-        best = (every - near).detach().norm(dim=-1).argmin(dim=0)
-        return every[best, torch.arange(len(points), device=points.device)]
+        x, there = (p.detach().cpu().double().numpy() for p in (points, near))
+        sign, shift = (
+            torch.as_tensor(part).to(points) for part in nearest_lifts(x, there, self.even, lattice)
+        )
+        return sign * points + shift
 
     def nearest_rotation(self, rotation: Tensor) -> Tensor:
         """The identity (2, 2): a lattice of general shape has no other rotation."""
@@ -277,7 +273,7 @@ class Orbifold(ClosedDomain):
         return embed_orbifold(vertices, faces, keys)
 
     def equivariant(self, network: nn.Module) -> nn.Module:
-        """h(x) = x + ½(n(x) - n(-x)) around a periodic network n."""
+        """h(x) = x + ½(n(x) - n(-x)) around a periodic network n; x + n(x) if n is odd."""
         from nsm.maps import EquivariantMap, TorusMap
 
         return TorusMap(network) if getattr(network, "odd", False) else EquivariantMap(network)

@@ -17,6 +17,7 @@ def write_report(
     output: Path,
     title: str = "nsm report",
     trust: Sequence[str] = (),
+    up: str = "y",
 ) -> tuple[int, int]:
     """Write one page about all runs in folders and their subfolders.
 
@@ -25,6 +26,7 @@ def write_report(
         output: the HTML file.
         title: of the page.
         trust: modules outside nsm whose code the files of the runs may name.
+        up: the axis of the mesh files that points up: x, y, z, -x, -y or -z.
 
     Returns:
         The numbers of complete and of incomplete runs.
@@ -40,7 +42,7 @@ def write_report(
         reason = f"{output}: is a folder; give a file name for the page"
         raise NsmError(reason, kind="not_a_file", key=str(output))
     runs, incomplete = find_runs(folders)
-    text = page(title, content(title, runs, incomplete, trust))
+    text = page(title, content(title, runs, incomplete, trust, up))
     try:
         atomic_write(output, text.encode())
     except OSError as error:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,14 +11,16 @@ import numpy as np
 
 from nsm.errors import NsmError
 from nsm.results.report.curves import read_curves
-from nsm.results.report.pictures import read_pictures
-from nsm.results.report.runs import Incomplete, Run
+from nsm.results.report.labels import differing, labels, over_seeds, shown
+from nsm.results.report.pictures import UNREADABLE, read_picture, read_pictures
+from nsm.results.report.runs import Incomplete, Run, short
 from nsm.results.report.shapes import Distortion, Shape, read_shapes
+from nsm.results.report.sweep import FIGURE
 from nsm.results.tables import FIGURES
 
 _BINS = 60
+_TALLEST = 8000  # pixels of the figure of a sweep
 _HISTOGRAMS = ("symmetric dirichlet", "singular value ratio", "area")
-_LABEL_SETTINGS = 3  # at most, of the settings that differ, in the label of a run
 _BEST = {
     "covered_percent": "high",
     "normal_variation_excess_degrees": "zero",
@@ -51,7 +51,11 @@ class _Arrays:
 
 
 def content(
-    title: str, runs: Sequence[Run], incomplete: Sequence[Incomplete], trust: Sequence[str] = ()
+    title: str,
+    runs: Sequence[Run],
+    incomplete: Sequence[Incomplete],
+    trust: Sequence[str] = (),
+    up: str = "y",
 ) -> dict[str, Any]:
     """Everything on the page. Files that cannot be read are listed with the incomplete runs."""
     arrays = _Arrays()
@@ -60,7 +64,27 @@ def content(
     for task in sorted({run.task for run in runs}):
         of_task = [run for run in runs if run.task == task]
         tasks.append(_task(task, of_task, arrays, remarks, trust))
-    return {"title": title, "tasks": tasks, "incomplete": remarks, "arrays": arrays.stored}
+    return {
+        "title": title,
+        "up": up,
+        "sweeps": _sweeps(runs, remarks),
+        "tasks": tasks,
+        "incomplete": remarks,
+        "arrays": arrays.stored,
+    }
+
+
+def _sweeps(runs: Sequence[Run], remarks: list[dict[str, str]]) -> list[dict[str, str]]:
+    """The figures that sweeps left; adds remarks on those that cannot be read."""
+    pictures = []
+    for folder in dict.fromkeys(run.folder.resolve().parent for run in runs):
+        if (folder / FIGURE).is_file():
+            try:
+                picture = read_picture(folder / FIGURE, _TALLEST)
+                pictures.append({"name": folder.name, "picture": picture})
+            except UNREADABLE as error:
+                remarks.append({"name": folder.name, "reason": f"{FIGURE}: {short(error)}"})
+    return pictures
 
 
 def _task(
@@ -71,11 +95,9 @@ def _task(
     trust: Sequence[str],
 ) -> dict[str, Any]:
     """The runs of one task; adds remarks on files that cannot be read."""
-    differing = _differing(runs)
-    labels = _labels(runs, differing)
-    shown = []
+    entries = []
     distortions: list[Distortion | None] = []
-    for run, label in zip(runs, labels, strict=True):
+    for run, label in zip(runs, labels(runs), strict=True):
         curves, of_curves = read_curves(run.folder)
         pictures, of_pictures = read_pictures(run.folder)
         reasons = [*of_curves, *of_pictures]
@@ -87,11 +109,11 @@ def _task(
             reasons.append(f"no 3D view and no histogram: {error}")
         distortions.append(distortion)
         remarks += [{"name": run.name, "reason": reason} for reason in reasons]
-        shown.append(
+        entries.append(
             {
                 "name": run.name,
                 "label": label,
-                "settings": {key: _shown(value) for key, value in run.settings.items()},
+                "settings": {key: shown(value) for key, value in run.settings.items()},
                 "figures": run.figures,
                 "curves": {tag: curve._asdict() for tag, curve in curves.items()},
                 "pictures": pictures,
@@ -100,58 +122,12 @@ def _task(
         )
     return {
         "name": task,
-        "differing": differing,
+        "differing": differing(runs),
         "figures": _described({key for run in runs for key in run.figures}),
         "histograms": _histograms(distortions),
-        "runs": shown,
+        "runs": entries,
+        "seeds": [group._asdict() for group in over_seeds(runs)],
     }
-
-
-def _differing(runs: Sequence[Run]) -> list[str]:
-    """The settings that are not the same in all runs."""
-    keys = dict.fromkeys(key for run in runs for key in run.settings)
-
-    def values(key: str) -> set[str]:
-        return {f"={_shown(run.settings[key])}" if key in run.settings else "" for run in runs}
-
-    return [key for key in keys if len(values(key)) > 1]
-
-
-def _labels(runs: Sequence[Run], differing: Sequence[str]) -> list[str]:
-    """A short label for each run: settings that differ, or its path if those are not unique."""
-    last = Counter(key.rsplit(".", 1)[-1] for key in differing)
-    labels = []
-    for run in runs:
-        # the choice of a group stands for its parameters
-        chosen = [
-            key
-            for key in differing
-            if isinstance(run.settings.get(key), (str, int, float))
-            and key.rpartition(".")[0] not in differing
-        ]
-        short = {key: key.rsplit(".", 1)[-1] for key in chosen[:_LABEL_SETTINGS]}
-        parts = [
-            f"{end if last[end] == 1 else key}={_brief(run.settings[key])}"
-            for key, end in short.items()
-        ]
-        labels.append(", ".join(parts))
-    if len(set(labels)) < len(labels) or not all(labels):
-        return [run.name for run in runs]
-    return labels
-
-
-def _brief(value: Any) -> str:
-    """A setting in a label: of a path the last part."""
-    return str(_shown(value)).rsplit("/", 1)[-1][:40]
-
-
-def _shown(value: Any) -> str | float | None:
-    """A setting on the page: finite numbers unchanged, everything else as text."""
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return value if abs(value) < float("inf") else str(value)
-    if value is None or isinstance(value, str):
-        return value
-    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _described(keys: set[str]) -> list[dict[str, Any]]:
@@ -209,6 +185,8 @@ def _packed(shape: Shape, arrays: _Arrays) -> dict[str, Any]:
         "vertices": arrays.add(shape.vertices),
         "faces": arrays.add(shape.faces),
         "colours": colours,
-        "up": _rounded(shape.frame[1]),
-        "towards": _rounded(shape.frame[2]),
+        "frames": {
+            axis: {"up": _rounded(frame[1]), "towards": _rounded(frame[2])}
+            for axis, frame in shape.frames.items()
+        },
     }

@@ -7,6 +7,7 @@
   const DASHES = ["solid", "dash", "dot", "dashdot"];
   const VIEWS = 6; // browsers limit the 3D contexts of a page
   const MISSING = "—";
+  const FOLDED = 60; // characters of a setting that are shown
 
   const $ = (selector) => document.querySelector(selector);
   // all content of files enters the page here, as text
@@ -25,7 +26,7 @@
   // plotly interprets some markup in labels
   const label = (text) => short(text, 44).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
 
-  const { title, tasks, incomplete, arrays } = JSON.parse(await decompressed("content"));
+  const { title, up, sweeps, tasks, incomplete, arrays } = JSON.parse(await decompressed("content"));
   const array = (index) => {
     const stored = arrays[index];
     if (!stored.values) {
@@ -47,7 +48,7 @@
       run.dash = DASHES[Math.floor(n / PALETTE.length) % DASHES.length];
     });
   }
-  const choices = { axis: "steps", log: true, all: false };
+  const choices = { axis: "steps", log: true, all: false, up };
 
   // ---- controls
   const control = (section, ...elements) => $(section + " .controls").replaceChildren(...elements);
@@ -164,7 +165,7 @@
           continue;
         }
         const top = value !== null && value === bests.get(column.key);
-        row.append(make("td", { className: (column.number ? "number" : "setting") + (top ? " best" : ""), textContent: short(shown(value), 60), title: column.number ? "" : shown(value) }));
+        row.append(make("td", { className: (column.number ? "number" : "setting") + (top ? " best" : ""), title: column.number ? "" : shown(value) }, folded(shown(value))));
       }
       rows.push(row);
       if (task.open.has(run)) rows.push(details(run, all.length));
@@ -172,12 +173,30 @@
     if (!runs.length) rows.push(make("tr", {}, make("td", { colSpan: all.length, textContent: "no run matches the filters" })));
     $("#table tbody").replaceChildren(...rows);
   };
+  // a long text, such as a list of paths, opens on a click
+  const folded = (text) => String(text).length <= FOLDED ? String(text) :
+    make("details", {}, make("summary", { textContent: short(text, FOLDED) }), String(text));
   const details = (run, width) => {
     const list = make("dl");
     for (const [key, value] of [["path", run.name], ...Object.entries(run.settings)]) {
-      list.append(make("div", {}, make("dt", { textContent: key }), make("dd", { textContent: shown(value) })));
+      list.append(make("div", {}, make("dt", { textContent: key }), make("dd", {}, folded(shown(value)))));
     }
     return make("tr", { className: "details" }, make("td", { colSpan: width }, list));
+  };
+
+  // ---- seeds
+  const drawSeeds = () => {
+    $("#seeds").hidden = !task.seeds.length;
+    const figures = task.figures.filter((figure) => (figure.main || choices.all) && task.seeds.some((group) => group.figures[figure.key]));
+    const head = make("tr", {}, make("th", { className: "first", textContent: "runs" }), make("th", { className: "number", textContent: "seeds" }),
+      ...figures.map((figure) => make("th", { className: "number", textContent: figure.label }, make("small", { textContent: figure.unit }))));
+    $("#seeds thead").replaceChildren(head);
+    $("#seeds tbody").replaceChildren(...task.seeds.map((group) => make("tr", {}, make("td", { className: "first", textContent: group.label }),
+      make("td", { className: "number", textContent: group.runs.length }),
+      ...figures.map((figure) => {
+        const known = group.figures[figure.key];
+        return make("td", { className: "number", textContent: known ? `${shown(known[0])} ± ${shown(known[1])}` : MISSING });
+      }))));
   };
 
   // ---- plots
@@ -204,8 +223,9 @@
     const tags = [...new Set(task.runs.flatMap((run) => Object.keys(run.curves)))];
     $("#curves").hidden = !tags.length;
     if (!tags.length) return;
-    const first = ["val/rms_percent", "val/distortion", "train/loss"]
-      .find((tag) => task.runs.some((run) => run.curves[tag]?.steps.length > 2)) ?? tags[0];
+    const drawn = tags.filter((tag) => task.runs.some((run) => run.curves[tag]?.steps.length > 1));
+    const first = ["val/rms_percent", "val/distortion"].find((tag) => drawn.includes(tag)) ??
+      drawn.find((tag) => tag.startsWith("val/")) ?? drawn.find((tag) => tag === "train/loss") ?? drawn[0] ?? tags[0];
     const timed = task.runs.some((run) => Object.values(run.curves).some((curve) => curve.seconds));
     if (!tags.includes(choices.tag)) choices.tag = first;
     control("#curves", select("curve", tags, "tag", drawCurves),
@@ -240,6 +260,11 @@
   };
 
   // ---- pictures
+  const enlarged = (src, alt) => {
+    const image = make("img", { src, alt });
+    image.onclick = () => { $("#large img").src = src; $("#large").showModal(); };
+    return image;
+  };
   const drawPictures = () => {
     const names = [...new Set(task.runs.flatMap((run) => Object.keys(run.pictures)))];
     $("#pictures").hidden = !names.length;
@@ -248,8 +273,7 @@
     const figures = visible()
       .filter((run) => run.pictures[choices.picture])
       .map((run) => {
-        const image = make("img", { src: run.pictures[choices.picture], alt: choices.picture + " of " + run.label });
-        image.onclick = () => { $("#large img").src = image.src; $("#large").showModal(); };
+        const image = enlarged(run.pictures[choices.picture], choices.picture + " of " + run.label);
         return make("figure", {}, make("figcaption", {}, dot(run), run.label), image);
       });
     $("#pictures .grid").replaceChildren(...figures);
@@ -286,10 +310,11 @@
       run.shapes.filter((shape) => shape.name === choices.shape).map((shape) => [run, shape]));
     const keys = [...new Set(shapes.flatMap(([, shape]) => Object.keys(shape.colours)))];
     const by = select("colour", [...keys, "none"], "colour", drawShapes);
+    const upward = select("up", ["y", "-y", "z", "-z", "x", "-x"], "up", drawShapes);
     const pages = Math.max(1, Math.ceil(shapes.length / VIEWS));
     page = Math.min(page, pages - 1);
     const step = (symbol, to) => make("button", { type: "button", textContent: symbol, disabled: to < 0 || to >= pages, onclick: () => { page = to; drawShapes(); } });
-    control("#shapes", chosen, by, ...(pages > 1 ? [step("‹", page - 1), `${page + 1} / ${pages}`, step("›", page + 1)] : []));
+    control("#shapes", chosen, by, upward, ...(pages > 1 ? [step("‹", page - 1), `${page + 1} / ${pages}`, step("›", page + 1)] : []));
 
     const ranges = shapes.map(([, shape]) => shape.colours[choices.colour]?.range).filter(Boolean);
     const low = Math.min(...ranges.map((range) => range[0])), high = Math.max(...ranges.map((range) => range[1]));
@@ -318,7 +343,8 @@
             colorbar: { thickness: 10, len: 0.85, tickfont: { color: look("ink") } },
           }
         : { color: "#c5cbd6", showscale: false };
-      const [tx, ty, tz] = shape.towards, [ux, uy, uz] = shape.up;
+      const frame = shape.frames[choices.up];
+      const [tx, ty, tz] = frame.towards, [ux, uy, uz] = frame.up;
       const hidden = { visible: false, showspikes: false };
       await Plotly.react(view,
         [{
@@ -328,10 +354,10 @@
         }],
         {
           modebar: { bgcolor: "transparent", color: look("faint"), activecolor: look("accent") },
-          paper_bgcolor: "transparent", margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: task.name + choices.shape,
+          paper_bgcolor: "transparent", margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: task.name + choices.shape + choices.up,
           scene: {
             xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "manual", aspectratio: { x: ax, y: ay, z: az }, bgcolor: "transparent",
-            uirevision: task.name + choices.shape,
+            uirevision: task.name + choices.shape + choices.up,
             camera: { up: { x: ux, y: uy, z: uz }, eye: { x: 1.45 * tx, y: 1.45 * ty, z: 1.45 * tz } },
           },
         }, CONFIG);
@@ -345,6 +371,7 @@
   // ---- page
   const update = () => {
     body();
+    drawSeeds();
     if (!window.Plotly) return;
     drawCurves();
     drawDistortion();
@@ -366,6 +393,10 @@
   $("h1").textContent = title;
   const count = tasks.reduce((sum, one) => sum + one.runs.length, 0);
   $("#count").textContent = `${count} run${count === 1 ? "" : "s"}` + (incomplete.length ? `, ${incomplete.length} problem${incomplete.length === 1 ? "" : "s"} (see the end of the page)` : "");
+  $("#sweeps").hidden = !sweeps.length;
+  for (const sweep of sweeps) {
+    $("#sweeps").append(make("figure", {}, make("figcaption", { textContent: sweep.name }), enlarged(sweep.picture, sweep.name)));
+  }
   $("#incomplete").hidden = !incomplete.length;
   for (const item of incomplete) {
     $("#incomplete ul").append(make("li", {}, item.name + " ", make("span", { textContent: item.reason })));

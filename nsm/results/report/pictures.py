@@ -11,6 +11,7 @@ from PIL import Image
 from nsm.results.report.runs import short
 
 _WIDTH = 1000
+UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def read_pictures(folder: Path) -> tuple[dict[str, str], list[str]]:
@@ -21,12 +22,16 @@ def read_pictures(folder: Path) -> tuple[dict[str, str], list[str]]:
         if file.stem.endswith("_texture"):
             continue
         try:
-            with Image.open(file) as image:
-                image.thumbnail((_WIDTH, 2 * _WIDTH))
-                data = io.BytesIO()
-                image.convert("RGB").save(data, format="WEBP", quality=82)
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            pictures[file.stem] = read_picture(file)
+        except UNREADABLE as error:
             remarks.append(f"{file.name}: {short(error)}")
-            continue
-        pictures[file.stem] = f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode()}"
     return pictures, remarks
+
+
+def read_picture(file: Path, tallest: int = 2 * _WIDTH) -> str:
+    """The data URI of a picture, reduced to at most 1000 pixels in width and to a height."""
+    with Image.open(file) as image:
+        image.thumbnail((_WIDTH, tallest))
+        data = io.BytesIO()
+        image.convert("RGB").save(data, format="WEBP", quality=82)
+    return f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode()}"

@@ -12,11 +12,11 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from nsm.errors import NsmError
+from nsm.results.readable_settings import readable
 
 Figure = float | str | None
 
-# settings that do not affect a result
-_INCIDENTAL = ("resume", "logger", "artefacts", "trust", "trainer.progress")
+_NAMED = 4  # surfaces of a collection in its name
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class Run:
         folder: of the run.
         name: its path below the folder that was searched.
         task: overfit, param, ...
+        subject: what it is of: a surface, "source → target", or the surfaces of a collection.
         settings: values by "group.key"; the class or name that a group chooses by "group".
         figures: numbers, yes or no by name; None for a number that is not finite.
     """
@@ -34,6 +35,7 @@ class Run:
     folder: Path
     name: str
     task: str
+    subject: str
     settings: dict[str, Any]
     figures: dict[str, Figure]
 
@@ -102,39 +104,35 @@ def _unfinished(folder: Path) -> str:
 
 def _read(folder: Path, name: str) -> Run:
     try:
-        figures = _figures(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+        stored = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        figures = _figures(stored)
     except (OSError, ValueError, RecursionError, TypeError) as error:
         raise _damaged(f"metrics.json is damaged: {short(error)}", folder) from error
     try:
         config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         if not isinstance(config, dict):
             raise ValueError("it has no settings")
-        settings = dict(_flat(config))
+        settings = readable(config)
         task = settings.pop("task")
     except FileNotFoundError as error:
         raise _damaged("config.yaml is missing", folder) from error
     except Exception as error:  # a damaged or foreign file raises any exception
         raise _damaged(f"config.yaml is damaged: {short(error)}", folder) from error
-    return Run(folder, name, str(task), settings, figures)
+    return Run(folder, name, str(task), _subject(stored), settings, figures)
+
+
+def _subject(stored: Mapping[str, Any]) -> str:
+    surfaces = stored.get("surfaces")
+    if isinstance(surfaces, list) and surfaces:
+        few = [str(name) for name in surfaces[:_NAMED]]
+        more = [f"{len(surfaces) - _NAMED} more"] if len(surfaces) > _NAMED else []
+        return ", ".join([*few, *more])
+    ends = [str(stored[key]) for key in ("surface", "target") if isinstance(stored.get(key), str)]
+    return " → ".join(ends)
 
 
 def _damaged(reason: str, folder: Path) -> NsmError:
     return NsmError(reason, kind="damaged_file", key=str(folder))
-
-
-def _flat(settings: Mapping[Any, Any], group: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings by "group.key"; the ``name`` or ``_target_`` of a group by "group"."""
-    for key, value in settings.items():
-        name = f"{group}.{key}" if group else str(key)
-        if name in _INCIDENTAL or (key == "_target_" and "name" in settings):
-            continue
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, name)
-        elif group and key == "_target_":
-            ours = str(value).startswith(("nsm.", "torch."))
-            yield group, str(value).rsplit(".", 1)[-1] if ours else value
-        else:
-            yield (group if group and key == "name" else name), value
 
 
 def _figures(content: Any) -> dict[str, Figure]:

@@ -12,12 +12,13 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
 from nsm.results.collection import load_collection
-from nsm.results.metrics import vertex_error
+from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.pair_metrics import ENERGIES, triangle_energies
 from nsm.results.parameterization import load_parameterization
-from nsm.results.render import view_frame
+from nsm.results.render import UP_AXES, frames_of
 from nsm.results.report.runs import short
-from nsm.results.surface_map import SurfaceMap, load_surface_map
+from nsm.results.stored_map import load_surface_map
+from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces.geometry import decimate
 from nsm.surfaces.topology import face_areas
 
@@ -26,13 +27,16 @@ _FACES = 50_000  # at most, per shape; finer meshes are decimated for the page
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh (V, 3), (F, 3) to display, with values (V,) or (F,) to colour it by."""
+    """A mesh (V, 3), (F, 3) to display, with values (V,) or (F,) to colour it by.
+
+    ``frames`` are rows right, up and towards the viewer (3, 3) by the axis that points up.
+    """
 
     name: str
     vertices: np.ndarray
     faces: np.ndarray
     colours: dict[str, np.ndarray]
-    frame: np.ndarray
+    frames: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -74,17 +78,17 @@ def read_shapes(
 def _overfit(folder: Path, trust: Sequence[str]) -> _Read:
     neural = load_surface(folder, trust=trust)
     surface = neural.surface
-    vertices, faces = neural(surface.uv), surface.faces
+    vertices, faces = evaluate(neural.map, surface.uv), surface.faces
     distortion = _measured(surface.vertices, vertices, faces)
     colours = {
         "distance, % of diagonal": vertex_error(surface, neural.map),
         "normal error, degrees": _face_angles(vertices, surface.vertices, faces),
         **distortion.values,
     }
-    frame = view_frame(surface.vertices)
+    frames = frames_of(surface.vertices)
     shapes = [
-        _shape("neural surface", vertices, faces, colours, frame),
-        _shape("source mesh", surface.vertices, faces, {}, frame),
+        _shape("neural surface", vertices, faces, colours, frames),
+        _shape("source mesh", surface.vertices, faces, {}, frames),
     ]
     return shapes, distortion
 
@@ -95,7 +99,9 @@ def _param(folder: Path, trust: Sequence[str]) -> _Read:
     flat = np.column_stack([uv, np.zeros(len(uv))])
     distortion = _measured(surface.vertices, flat, surface.faces)
     shapes = [
-        _shape("flattened", flat, surface.faces, distortion.values, np.eye(3)),
+        _shape(
+            "flattened", flat, surface.faces, distortion.values, dict.fromkeys(UP_AXES, np.eye(3))
+        ),
         _shape("surface", surface.vertices, surface.faces, distortion.values),
     ]
     return shapes, distortion
@@ -140,10 +146,10 @@ def _both_ends(
     # a point and its image get the same colour, which shows the correspondence
     positions = {f"{axis} on the source": surface.vertices[:, k] for k, axis in enumerate("xyz")}
     colours = {**distortion.values, **positions}
-    frame = view_frame(f.target.surface.vertices)
+    frames = frames_of(f.target.surface.vertices)
 
     def image(name: str) -> Shape:
-        return _shape(name, f.image, surface.faces, colours, frame)
+        return _shape(name, f.image, surface.faces, colours, frames)
 
     def source(name: str) -> Shape:
         return _shape(name, surface.vertices, surface.faces, colours)
@@ -171,15 +177,15 @@ def _shape(
     vertices: np.ndarray,
     faces: np.ndarray,
     colours: dict[str, np.ndarray],
-    frame: np.ndarray | None = None,
+    frames: dict[str, np.ndarray] | None = None,
 ) -> Shape:
-    if frame is None:
-        frame = view_frame(vertices)
+    if frames is None:
+        frames = frames_of(vertices)
     if len(faces) <= _FACES:
-        return Shape(name, vertices, faces, colours, frame)
+        return Shape(name, vertices, faces, colours, frames)
     kept, coarse, parent = decimate(vertices, faces, _FACES)
     decimated = {
         key: values[kept] if len(values) == len(vertices) else values[parent]
         for key, values in colours.items()
     }
-    return Shape(name, vertices[kept], coarse, decimated, frame)
+    return Shape(name, vertices[kept], coarse, decimated, frames)

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from matplotlib.colors import hsv_to_rgb
 
 from nsm.correspondence.landmark_list import LandmarkList
 from nsm.correspondence.preview import previewed
 from nsm.errors import NsmError
+from nsm.results.meshes import by_position
+from nsm.results.view.colours import distinct_colours
 from nsm.results.view.picking import hit
 
 _GAP = 1.3  # between the middles of shapes, in diameters
 _RADIUS = 0.02  # of a marker; every shape has the diameter one
-_GOLDEN = 0.618034  # each landmark's hue is that far from the one before
 _GREY, _UNPLACED = (190, 190, 190), "–"
 
 
@@ -136,7 +136,7 @@ class LandmarkEditor:
         """Colour the first shape by position, the others as their coarse maps carry it there."""
         names, lists = self.landmarks.complete()
         source = self.shapes[0]
-        colours = [_by_position(self.placed[0])]
+        colours = [255 * by_position(self.placed[0])]
         lines = []
         try:
             for shape, ids in zip(self.shapes[1:], lists[1:], strict=True):
@@ -148,7 +148,7 @@ class LandmarkEditor:
                 colours.append(_carried(colours[0], found.candidate, shape.vertices))
                 worst = int(found.off.argmax())
                 lines.append(
-                    f"{source.name} → {shape.name}: mean energy {found.energy:.2f} (4 at best); "
+                    f"{source.name} → {shape.name}: mean energy {found.energy:.2f} (3.98 at best); "
                     f"{names[worst]} is farthest off, {found.off[worst]:.2f} of √area"
                 )
         except NsmError as error:
@@ -197,13 +197,13 @@ class LandmarkEditor:
         self.name.value = "" if self.selected is None else self._names[self.selected]
 
     def _show_point(self, number: int, side: int, vertex: int) -> None:
-        colour = hsv_to_rgb([number * _GOLDEN % 1, 1.0, 0.9])
+        colour = distinct_colours(len(self.landmarks.landmarks))[number]
         position = self.placed[side][vertex]
         name = f"/shape{side}/landmark{number}"
         self.markers[number, side] = self.server.scene.add_icosphere(
             name,
             radius=_RADIUS * (1.6 if number == self.selected else 1.0),
-            color=tuple(np.round(255 * colour).astype(int).tolist()),
+            color=tuple(colour.tolist()),
             position=position,
         )
         self.server.scene.add_label(
@@ -261,12 +261,6 @@ class LandmarkEditor:
                 act()
 
         return call
-
-
-def _by_position(vertices: np.ndarray) -> np.ndarray:
-    """Colours (V, 3) in [0, 255] by place in the bounding box."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return np.asarray(255 * (vertices - low) / np.maximum(high - low, 1e-12))
 
 
 def _carried(colours: np.ndarray, candidate: Any, vertices: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ class Pick:
         uv: (2, 2) both points in the domains of their shapes.
         coordinates: both points as displayed (see :class:`nsm.results.view.scene.Shape`).
         values: the scene's energies and errors at the point.
+        vertices: for both points, the number in the mesh file of the corner of their triangle that
+            they are nearest to in barycentric coordinates; -1 if that was inserted.
     """
 
     side: int
@@ -27,6 +29,7 @@ class Pick:
     uv: np.ndarray
     coordinates: tuple[np.ndarray, np.ndarray]
     values: dict[str, float]
+    vertices: tuple[int, int]
 
 
 def hit(
@@ -93,4 +96,11 @@ def pick_at(scene: Scene, side: int, place: Places) -> Pick:
     values = {name: float(energy[source.face[0]]) for name, energy in scene.energies.items()}
     for name, error in scene.errors.items():
         values[name] = float(source.take(error, scene.source.faces)[0])
-    return Pick(side, places, uv, (coordinates[0], coordinates[1]), values)
+    vertices = [int(shape.numbers[_corner(at, shape.faces)]) for at, shape in ends]
+    return Pick(
+        side, places, uv, (coordinates[0], coordinates[1]), values, (vertices[0], vertices[1])
+    )
+
+
+def _corner(place: Places, faces: np.ndarray) -> int:
+    return int(faces[place.face[0], place.weights[0].argmax()])

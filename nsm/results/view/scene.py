@@ -13,22 +13,17 @@ from matplotlib.colors import LogNorm, Normalize
 
 from nsm.domains import Surface
 from nsm.results.artifact import NeuralSurface
-from nsm.results.metrics import vertex_error
+from nsm.results.meshes import by_position
+from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.pair_metrics import triangle_energies
 from nsm.results.parameterization import Parameterization
 from nsm.results.pictures import GREY, vertex_means
-from nsm.results.render import vertex_normals, view_frame
+from nsm.results.render import frames_of, vertex_normals
 from nsm.results.surface_map import SurfaceMap
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import edges_of
 
 POSITION, PLAIN = "position on the source", "plain"
-# rotations of each axis to y, the upward axis of a view
-UP_AXES = {
-    sign + axis: flip @ np.roll(np.eye(3), -k, axis=0)
-    for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
-    for k, axis in enumerate("yzx")
-}
 _GAP = 0.2  # between the shapes, in widths of the wider one
 _FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; others use percentiles
 _LARGEST = 1e3
@@ -51,6 +46,7 @@ class Shape:
         seam_pairs: (T, 2) copies of the same vertex of the uncut mesh.
         landmarks: (L,) vertices.
         closed: the mesh was not cut; copies of a vertex are lifts of it.
+        numbers: (V,) the vertices' numbers in the mesh file, -1 for points that were inserted.
     """
 
     name: str
@@ -61,6 +57,7 @@ class Shape:
     seam_pairs: np.ndarray
     landmarks: np.ndarray = field(default_factory=lambda: _NO_VERTICES)
     closed: bool = False
+    numbers: np.ndarray = field(default_factory=lambda: _NO_VERTICES)
 
     @cached_property
     def _uncut(self) -> np.ndarray:
@@ -178,8 +175,7 @@ class Scene:
             return Paint(scale.colours(values), None), Paint(scale.colours(on_target), None)
         colours = np.tile(GREY, (len(vertices), 1))
         if name == POSITION:
-            extent = np.maximum(np.ptp(vertices, axis=0), 1e-12)
-            colours = (vertices - vertices.min(axis=0)) / extent
+            colours = by_position(vertices)
         return Paint(colours, None), Paint(self.transferred(colours), None)
 
     def scale(self, name: str) -> Scale | None:
@@ -231,12 +227,12 @@ def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y
 
     Args:
         result: of a run.
-        up: the axis of the (source's) mesh file that points up, one of :data:`UP_AXES`.
+        up: the axis of the (source's) mesh file that points up, of
+            :data:`nsm.results.render.UP_AXES`.
     """
     mesh = result.source if isinstance(result, SurfaceMap) else result
     mesh = mesh.phi if isinstance(mesh, Parameterization) else mesh
-    turn = UP_AXES[up]
-    frame = view_frame(mesh.surface.vertices @ turn.T) @ turn
+    frame = frames_of(mesh.surface.vertices)[up]
     if isinstance(result, SurfaceMap):
         return _pair(result, frame)
     if isinstance(result, Parameterization):
@@ -246,7 +242,7 @@ def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y
 
 def _overfit(neural: NeuralSurface, frame: np.ndarray) -> Scene:
     s = neural.surface
-    image = neural(s.uv)
+    image = evaluate(neural.map, s.uv)
     errors = {"distance, % of diagonal": vertex_error(s, neural.map)}
     centre = _centre(s.vertices, frame)
     source = _file_shape(f"{s.name}: mesh", neural, s.vertices - centre, s.vertices)
@@ -264,7 +260,8 @@ def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
     # facing the viewer, whatever the frame
     flat = (uv - middle) @ frame[:2]
     source = _file_shape(s.name, result.phi, s.vertices - _centre(s.vertices, frame), s.vertices)
-    target = Shape(f"{s.name}: flattened", flat, s.faces, s.uv, uv, s.seam_pairs)
+    name, numbers = f"{s.name}: flattened", s.source_vertex
+    target = Shape(name, flat, s.faces, s.uv, uv, s.seam_pairs, numbers=numbers)
     checkerboards = {
         "checkerboard of the plane": 2 * (uv - middle) / np.ptp(uv, axis=0).max(),
         "checkerboard of the domain": s.uv,
@@ -297,7 +294,9 @@ def _file_shape(
     s = neural.surface
     coordinates = neural.in_original_units(vertices)
     closed, marked = not s.domain.has_boundary, s.cut_vertex[landmarks]
-    return Shape(name, shown, s.faces, s.uv, coordinates, s.seam_pairs, marked, closed)
+    return Shape(
+        name, shown, s.faces, s.uv, coordinates, s.seam_pairs, marked, closed, s.source_vertex
+    )
 
 
 def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:

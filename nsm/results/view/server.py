@@ -7,12 +7,11 @@ import errno
 import io
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import hsv_to_rgb
 from trimesh.creation import icosphere
 
 from nsm.errors import NsmError
@@ -20,22 +19,17 @@ from nsm.optional_dependencies import needed
 from nsm.results.artifact import NeuralSurface
 from nsm.results.collection import SurfaceCollection
 from nsm.results.parameterization import Parameterization
+from nsm.results.render import UP_AXES
 from nsm.results.surface_map import SurfaceMap
+from nsm.results.view.colours import distinct_colours
 from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import Pick, pick
-from nsm.results.view.scene import UP_AXES, scene_of
+from nsm.results.view.scene import scene_of
 
 Result = NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection
 
 _NODES = "/source", "/target"
-# of the latest picks, on both shapes; a new one replaces the oldest
-PICK_COLOURS = {
-    "red": (214, 39, 40),
-    "blue": (31, 119, 220),
-    "green": (44, 160, 44),
-    "purple": (148, 90, 200),
-    "orange": (255, 140, 0),
-}
+_PICKS = 5  # the latest, on both shapes; a new one replaces the oldest
 _SOURCE_SEAM, _TARGET_SEAM = (255, 120, 0), (0, 150, 200)
 # in normalized units: every surface has the area of Ω
 _PICK_RADIUS, _LANDMARK_RADIUS, _SEAM_WIDTH, _LIFT = 0.03, 0.014, 0.01, 0.004
@@ -52,8 +46,8 @@ class Viewer:
 
     def __init__(self, result: Result, server: Any) -> None:
         self.result, self.server = result, server
-        self.picks: dict[str, Pick] = {}  # by the name of their colour, oldest first
-        self.markers: dict[str, tuple[Any, Any]] = {}
+        self.picks: dict[int, Pick] = {}  # by their numbers from 1, oldest first
+        self.markers: dict[int, tuple[Any, Any]] = {}
         self._overlays: list[Any] = []
         self._lock = threading.RLock()  # viser runs callbacks in several threads
         self._pair = [0, 1]
@@ -79,10 +73,10 @@ class Viewer:
             found = pick(self.scene, *ray, self.shown)
             if found is None:
                 return
-            if len(self.picks) == len(PICK_COLOURS):
-                self.picks.pop(next(iter(self.picks)))
-            free = next(colour for colour in PICK_COLOURS if colour not in self.picks)
-            self.picks[free] = found
+            number = max(self.picks, default=0) + 1
+            if len(self.picks) == _PICKS:
+                self.picks.pop(min(self.picks))
+            self.picks[number] = found
             self._show_picks()
 
     def _build_panel(self) -> None:
@@ -204,7 +198,6 @@ class Viewer:
         count = len(shape.landmarks)
         if count == 0:
             return
-        hue = np.stack([np.arange(count) / count, np.ones(count), np.full(count, 0.9)], axis=1)
         ball = icosphere(subdivisions=2, radius=_LANDMARK_RADIUS)
         mark = self.server.scene.add_batched_meshes_simple(
             f"{_NODES[side]}/landmarks",
@@ -212,7 +205,7 @@ class Viewer:
             ball.faces,
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             batched_positions=self.shown[side][shape.landmarks] + self.scene.offsets[side],
-            batched_colors=np.round(255 * hsv_to_rgb(hue)).astype(np.uint8),
+            batched_colors=distinct_colours(count),
         )
         self._overlays.append(mark)
 
@@ -244,33 +237,46 @@ class Viewer:
             for marker in pair:
                 marker.remove()
         self.markers = {
-            colour: (self._marker(0, colour, found), self._marker(1, colour, found))
-            for colour, found in self.picks.items()
+            number: (self._marker(0, number, found), self._marker(1, number, found))
+            for number, found in self.picks.items()
         }
+        names = [shape.name for shape in self.scene.shapes]
         self._list.content = "\n\n".join(
-            _markdown(colour, found) for colour, found in reversed(self.picks.items())
+            _markdown(number, found, names) for number, found in reversed(self.picks.items())
         )
 
-    def _marker(self, side: int, colour: str, found: Pick) -> Any:
+    def _marker(self, side: int, number: int, found: Pick) -> Any:
         point = found.places[side].take(self.shown[side], self.scene.shapes[side].faces)[0]
-        return self.server.scene.add_icosphere(
-            f"{_NODES[side]}/{colour}",
+        node = f"{_NODES[side]}/point{number}"
+        colour = distinct_colours(_PICKS)[(number - 1) % _PICKS]
+        marker = self.server.scene.add_icosphere(
+            node,
             radius=_PICK_RADIUS,
-            color=PICK_COLOURS[colour],
+            color=tuple(colour.tolist()),
             position=point + self.scene.offsets[side],
         )
+        self.server.scene.add_label(
+            f"{node}/number", str(number), position=(0, 1.5 * _PICK_RADIUS, 0)
+        )
+        return marker
 
 
-def _markdown(colour: str, found: Pick) -> str:
-    """A pick as Markdown: both points, and the values there."""
+def _markdown(number: int, found: Pick, names: Sequence[str]) -> str:
+    """A pick as Markdown: both points by the names of their shapes, and the values there."""
     rows = [
-        f"{'**picked**' if side == found.side else 'image'} | {_numbers(found.coordinates[side])} "
-        f"| {_numbers(found.uv[side])}"
-        for side in (0, 1)
+        f"{_cell(name)}{' (picked)' if side == found.side else ''} "
+        f"| {'–' if found.vertices[side] < 0 else found.vertices[side]} "
+        f"| {_numbers(found.coordinates[side])} | {_numbers(found.uv[side])}"
+        for side, name in enumerate(names)
     ]
-    head = f"**{colour}** | point | u, v\n---|---|---"
+    head = f"**{number}** | vertex | point | u, v\n---|---|---|---"
     values = "; ".join(f"{name} {value:.4g}" for name, value in found.values.items())
     return "\n".join([head, *rows]) + f"\n\n{values}"
+
+
+def _cell(text: str) -> str:
+    """A text within a table of Markdown, whatever is in it."""
+    return "".join(c if c.isalnum() or c in " .:-" else f"\\{c}" for c in text)
 
 
 def _numbers(values: np.ndarray) -> str:

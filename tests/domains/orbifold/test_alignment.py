@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from nsm.domains import Orbifold, Surface, Torus
-from nsm.domains.orbifold.alignment import Alignment, alignments, alignments_to_first
+from nsm.domains.orbifold import collection_alignment
+from nsm.domains.orbifold.alignment import Alignment, alignments
+from nsm.domains.orbifold.collection_alignment import alignments_to_first, disagreements
 from nsm.domains.orbifold.embedding import (
     Embedding,
     embed_orbifold,
@@ -259,6 +261,24 @@ def test_a_collection(pair):
     alone = alignments(second, first, (ids, ids))[0]
     np.testing.assert_array_equal(found[1].matrix, alone.matrix)
     assert found[2].distortion == pytest.approx(found[0].distortion, abs=1e-6)
+    assert disagreements([first, second, first], found, [ids] * 3) == []
+
+
+def test_a_class_that_does_not_fit_the_other_pairs_is_told_and_not_taken(pair, monkeypatch):
+    points, one, others, other = pair
+    ids = landmarks(one, 7)
+    surfaces = [surface(points, one), surface(others, other), surface(points, one)]
+    best = alignments_to_first(surfaces, [ids] * 3)
+    wrong = alignments(surfaces[2], surfaces[0], (ids, ids))[1]
+    told = disagreements(surfaces, [*best[:2], wrong], [ids] * 3)
+    assert [(d.source, d.target) for d in told] == [(0, 2), (1, 2)]
+    assert all(d.own.score < d.composed.score for d in told)
+    # where the start is the worst of the likely classes, the pairs together correct it
+    monkeypatch.setattr(
+        collection_alignment, "alignments", lambda *given: alignments(*given)[:3][::-1]
+    )
+    again = alignments_to_first(surfaces, [ids] * 3)
+    assert [a.score for a in again] == pytest.approx([a.score for a in best], abs=1e-9)
 
 
 def test_other_domains_are_refused(sphere_like, torus_like):

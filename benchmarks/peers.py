@@ -1,0 +1,222 @@
+"""Maps beside those of another program, and flattenings beside libigl's SLIM, by the same figures.
+
+    python benchmarks/peers.py --meshes FOLDER [--pairs 384-388 ...] [--flatten shrec07-384.off ...]
+        [--command 'PROGRAM {source} {target} {landmarks} {image}' --name NAME]
+
+The command stands for any mapper that takes two meshes and landmarks. The words in braces become
+files: two OBJ meshes; pairs of vertices, counted from 0, a line each; and where it has to write the
+images of the source's vertices, in their order, on the target: a line "x y z" each, or a mesh file
+if the template ends a word with {image}.obj or {image}.off. Without a command, the peer is skipped.
+
+"Surface Maps via Adaptive Triangulations" (Schmidt, Pieper and Kobbelt 2023) comes as a library
+with a program for each of its figures. A program for this command reads the meshes and landmarks,
+runs the library's default phases, and writes the image of each vertex of the source.
+
+Seconds are CPU time from files to files. Flips are triangles whose image is turned against the
+target's normal where it lies, or is no triangle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+
+import nsm
+from nsm.results.meshes import export_mesh
+from nsm.results.pair_metrics import distortion_figures
+from nsm.results.surface_map import by_file_vertex
+from nsm.surfaces.landmark_files import read_marks
+from nsm.surfaces.landmarks import as_vertices
+from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.topology import face_areas
+
+RESULTS = Path(__file__).parent / "results" / "peers.json"
+OURS = {"nsm": [], "nsm, experiment=fast": ["experiment=fast"]}
+COLUMNS = {
+    "seconds": "seconds",
+    "symmetric_dirichlet_median": "median",
+    "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_percent": "flipped %",
+    "landmark_error_mean_percent": "landmarks, mean %",
+    "landmark_error_max_percent": "largest %",
+}
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+def figures(source: Mesh, target: Mesh, image: np.ndarray, marks: np.ndarray) -> dict[str, float]:
+    """Figures of a map of meshes, whoever has made it; both are scaled to one area first.
+
+    Args:
+        source, target: vertices (V, 3) and faces (F, 3).
+        image: (V, 3) points on the target, of the source's vertices; NaN where one has none.
+        marks: (L, 2) vertices of source and target.
+    """
+    (vertices, faces), (other, other_faces) = source, target
+    known = np.isfinite(image[faces]).all(axis=(1, 2))
+    faces = faces[known]
+    scale = np.sqrt(face_areas(vertices, faces).sum() / face_areas(other, other_faces).sum())
+    found = distortion_figures(vertices, scale * image, faces)
+    normal = np.cross(*(image[faces[:, k]] - image[faces[:, 0]] for k in (1, 2)))
+    middle = np.ascontiguousarray(image[faces].mean(axis=1))
+    near = igl.point_mesh_squared_distance(middle, np.ascontiguousarray(other), other_faces)[1]
+    corner = other[other_faces[near]]
+    outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    found["flipped_percent"] = 100 * float(((normal * outwards).sum(axis=1) <= 0).mean())
+    off = np.linalg.norm(image[marks[:, 0]] - other[marks[:, 1]], axis=1)
+    off *= 100 / np.linalg.norm(np.ptp(other, axis=0))
+    found["landmark_error_mean_percent"] = float(off.mean())
+    found["landmark_error_max_percent"] = float(off.max())
+    return {key: found[key] for key in COLUMNS if key in found}
+
+
+def by_command(template: str, source: Mesh, target: Mesh, marks: np.ndarray) -> dict[str, float]:
+    """Figures and seconds of the map of another program.
+
+    Raises:
+        RuntimeError: it ends with an error, or leaves no image of each vertex.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        files = {name: place / f"{name}.obj" for name in ("source", "target")}
+        for file, (vertices, faces) in zip(files.values(), (source, target), strict=True):
+            export_mesh(file, vertices, faces, None)
+        files |= {"landmarks": place / "landmarks.txt", "image": place / "image"}
+        np.savetxt(files["landmarks"], marks, fmt="%d")
+        words = [word.format(**files) for word in shlex.split(template)]
+        before = _seconds_of_children()
+        ended = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+        seconds = _seconds_of_children() - before
+        if ended.returncode:
+            last = (ended.stderr.strip().splitlines() or ["no message"])[-1]
+            raise RuntimeError(f"{words[0]} ended with status {ended.returncode}: {last}")
+        image = read_image(place)
+    if image.shape != source[0].shape:
+        raise RuntimeError(f"{words[0]} wrote {image.shape} for {len(source[0])} vertices")
+    return {"seconds": round(seconds, 1), **figures(source, target, image, marks)}
+
+
+def read_image(folder: Path) -> np.ndarray:
+    """The points (V, 3) in the file ``image`` of a folder, or in the mesh ``image.obj``.
+
+    Raises:
+        RuntimeError: there is none, or it has other than three numbers a line.
+    """
+    for file in sorted(folder.glob("image*")):
+        if file.suffix:
+            return load_mesh(file)[0]
+        try:
+            return np.loadtxt(file, ndmin=2)
+        except ValueError as error:
+            raise RuntimeError(f"the image is no table of points: {error}") from error
+    raise RuntimeError("it wrote no image")
+
+
+def _seconds_of_children() -> float:
+    spent = os.times()
+    return spent.children_user + spent.children_system
+
+
+def by_nsm(files: list[Path], marks: np.ndarray, overrides: list[str]) -> dict[str, float]:
+    """The same of nsm's map from raw files, with an empty cache and one thread."""
+    before, kept = os.times(), os.environ.get("NSM_CACHE")
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["NSM_CACHE"] = cache
+        try:
+            f = nsm.map_pair(*map(str, files), marks.tolist(), overrides=overrides, progress=False)
+        finally:
+            os.environ.pop("NSM_CACHE")
+            if kept is not None:
+                os.environ["NSM_CACHE"] = kept
+    after = os.times()
+    seconds = sum(after[:4]) - sum(before[:4])
+    image = by_file_vertex(f.source.surface, f.target.in_original_units(f.welded_image))
+    meshes = [load_mesh(file)[:2] for file in files]
+    return {"seconds": round(seconds, 1), **figures(*meshes, image, marks)}
+
+
+def flattened(file: Path) -> dict[str, dict[str, float]]:
+    """Figures of flattening a mesh, cut on the disc: nsm's, and libigl's SLIM on the same cut."""
+    from nsm.domains.baselines import slim
+
+    phi = nsm.overfit(nsm.Surface.load(file), overrides=["trainer.max_steps=0"], progress=False)
+    start = time.process_time()
+    flat = nsm.parameterize(phi, progress=False)
+    seconds = time.process_time() - start
+    surface = phi.surface
+    start = time.process_time()
+    slim(surface.vertices, surface.faces, surface.uv)
+    taken = {"nsm": seconds, "SLIM (libigl)": time.process_time() - start}
+    return {
+        name: {"seconds": round(spent, 1), **_chosen(flat.metrics[name])}
+        for name, spent in taken.items()
+    }
+
+
+def _chosen(metrics: dict[str, float]) -> dict[str, float]:
+    return {key: metrics[key] for key in COLUMNS if key in metrics}
+
+
+def pair_of(meshes: Path, pair: str) -> tuple[list[Path], np.ndarray]:
+    """The files of a pair, and its landmarks as vertices (L, 2)."""
+    names = [f"shrec07-{name}" for name in pair.split("-")]
+    files = [meshes / f"{name}.off" for name in names]
+    marks = []
+    for name, file in zip(names, files, strict=True):
+        vertices, faces, _ = load_mesh(file)
+        given = read_marks(meshes / "landmarks" / f"{name}.vts").landmarks
+        marks.append(as_vertices(given, vertices, faces, name).vertex)
+    return files, np.stack(marks, axis=1)
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """The results as Markdown."""
+    lines = [f"| shapes | method | {' | '.join(COLUMNS.values())} |"]
+    lines.append("|---" * (len(COLUMNS) + 2) + "|")
+    for case, ways in results.items():
+        for way, found in ways.items():
+            cells = [f"{found[key]:.3f}" if key in found else "–" for key in COLUMNS]
+            lines.append(f"| {case.replace('-', ' → ')} | {way} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--meshes", type=Path, required=True)
+    parser.add_argument("--pairs", nargs="*", default=["384-388"])
+    parser.add_argument("--flatten", nargs="*", default=["shrec07-384.off", "cow.obj"])
+    parser.add_argument("--command", help="template of the other program's command")
+    parser.add_argument("--name", default="peer", help="of the other program, in the table")
+    parser.add_argument("--ways", nargs="*", choices=OURS, default=list(OURS))
+    given = parser.parse_args()
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    if not given.command:
+        print(f"{given.name}: skipped, as there is no --command")
+    for pair in given.pairs:
+        files, marks = pair_of(given.meshes, pair)
+        known = results.setdefault(pair, {})
+        for way in given.ways:
+            known[way] = by_nsm(files, marks, OURS[way])
+        if given.command:
+            meshes = [load_mesh(file)[:2] for file in files]
+            try:
+                known[given.name] = by_command(given.command, *meshes, marks)
+            except RuntimeError as error:
+                print(f"{given.name}, {pair}: {error}")
+    for name in given.flatten:
+        results[f"flattening {Path(name).stem}"] = flattened(given.meshes / name)
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Correspondences of several closed surfaces without landmarks: one with each other one.
+
+Every surface is matched with a hub. Which of the hypotheses are taken is decided for all surfaces
+together: two maps from the hub also make one between their targets, which has its own change of
+distances and its own rigid residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
+from nsm.correspondence.layouts import quick_scores
+from nsm.correspondence.proposal import (
+    LARGEST_SCORE,
+    LEAST_MARGIN,
+    Hypothesis,
+    compared,
+    hypotheses,
+)
+
+_LEAST = 4  # landmarks, for common cones
+_KEPT = 5
+
+Choice = dict[int, int]  # of each member the number of its hypothesis
+Scores = dict[int, np.ndarray]  # (H,) of each member
+PairScores = dict[tuple[int, int], np.ndarray]  # (H, H') of two members
+
+
+@dataclass(frozen=True)
+class CollectionProposal:
+    """Landmarks of several surfaces, and how sure they are.
+
+    Attributes:
+        vertices: of each hypothesis (L, k) corresponding vertices, best first; the given ones
+            before others.
+        scores: (H,) mean of the members' scores and of those of the maps between them.
+        margin: by how much the score of a member rises if another of its hypotheses is taken.
+        given: how many landmarks were given.
+        sure: whether all members are far ahead, and good in themselves.
+    """
+
+    vertices: list[np.ndarray]
+    scores: list[float]
+    margin: float
+    given: int
+    sure: bool
+
+
+def proposed_for_all(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]], given: np.ndarray | None = None
+) -> CollectionProposal:
+    """Propose landmarks of several closed meshes of genus 0.
+
+    Args:
+        meshes: vertices (V, 3) and faces (F, 3) of each, k of them.
+        given: (G, k) corresponding vertices that are kept and completed; none by default.
+
+    Raises:
+        NsmError: as :func:`nsm.correspondence.proposal.proposed`.
+    """
+    k = len(meshes)
+    fixed = np.zeros((0, k), dtype=np.int64) if given is None else given
+    shapes = [coarse_shape(*mesh, fixed=fixed[:, i]) for i, mesh in enumerate(meshes)]
+    hub = hub_of(shapes)
+    others = [i for i in range(k) if i != hub]
+    found = {i: hypotheses(shapes[hub], shapes[i]) for i in others}
+    own = {i: np.array([h.score for h in found[i]]) for i in others}
+    between = {
+        (i, j): np.array([[_between(g, h) for h in found[j]] for g in found[i]]) / (k - 2)
+        for i, j in combinations(others, 2)
+    }
+    chosen = _least(own, between)
+    best = _total(own, between, chosen)
+    changed = []
+    for i in others:
+        for other in range(len(own[i])):
+            if other != chosen[i]:
+                way = {**chosen, i: other}
+                changed.append((_total(own, between, way) - best, way))
+    changed.sort(key=lambda entry: entry[0])
+    ways = [chosen, *(way for _, way in changed[: _KEPT - 1])]
+    margin = changed[0][0] if changed else np.inf
+    return CollectionProposal(
+        [_landmarks(shapes, hub, {i: found[i][n] for i, n in way.items()}) for way in ways],
+        [(best + rise) / len(others) for rise in (0.0, *(r for r, _ in changed[: _KEPT - 1]))],
+        float(margin),
+        len(fixed),
+        bool(margin > LEAST_MARGIN and all(own[i][n] < LARGEST_SCORE for i, n in chosen.items())),
+    )
+
+
+def hub_of(shapes: Sequence[CoarseShape]) -> int:
+    """The shape of which four tips make the least distorted domain: maps from it are the best."""
+    return int(np.argmin([quick_scores(shape)[1].min() for shape in shapes]))
+
+
+def _between(first: Hypothesis, second: Hypothesis) -> float:
+    """The score, without energy, of the map between the targets of two maps of one source."""
+    a, b = first.candidate, second.candidate
+    samples = a.source.shape.samples
+    return compared(a.target.shape, a.images(samples), b.target.shape, b.images(samples))
+
+
+def _total(
+    own: dict[int, np.ndarray], between: dict[tuple[int, int], np.ndarray], c: Choice
+) -> float:
+    alone = sum(float(scores[c[i]]) for i, scores in own.items())
+    return alone + sum(float(cost[c[i], c[j]]) for (i, j), cost in between.items())
+
+
+def _least(own: Scores, between: PairScores) -> Choice:
+    """The choice that no other choice of one member betters, from the members' own best ones."""
+    chosen = {i: int(scores.argmin()) for i, scores in own.items()}
+    while True:
+        now = _total(own, between, chosen)
+        ways = [{**chosen, i: n} for i, scores in own.items() for n in range(len(scores))]
+        best = min(ways, key=lambda way: _total(own, between, way))
+        if _total(own, between, best) >= now - 1e-9:
+            return chosen
+        chosen = best
+
+
+def _landmarks(shapes: Sequence[CoarseShape], hub: int, taken: dict[int, Hypothesis]) -> np.ndarray:
+    """Landmarks (L, k): given ones, and the hub's tips that correspond to tips of all others.
+
+    Where these are fewer than four, tips come in that correspond to those of most others; on the
+    rest they are where the map takes them.
+    """
+    tips = {i: dict(h.vertices.tolist()) for i, h in taken.items()}
+    every = list(dict.fromkeys(v for pairs in tips.values() for v in pairs))
+    every.sort(key=lambda v: -sum(v in pairs for pairs in tips.values()))  # stable
+    given = [int(v) for v in shapes[hub].ids[shapes[hub].fixed]]
+    rows: list[list[int]] = []
+    for v in [*given, *(v for v in every if v not in given)]:
+        if not all(v in pairs for pairs in tips.values()) and len(rows) >= _LEAST:
+            break
+        row = [v] * len(shapes)
+        for i, h in taken.items():
+            local = np.searchsorted(shapes[hub].ids, [v])
+            row[i] = tips[i].get(v, int(shapes[i].ids[h.candidate.images(local)[0]]))
+        if all(row[i] != other[i] for other in rows for i in range(len(shapes))):
+            rows.append(row)
+    return np.array(rows, dtype=np.int64).reshape(-1, len(shapes))

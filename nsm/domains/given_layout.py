@@ -1,0 +1,149 @@
+"""Layouts over Ω that start from the texture coordinates of a mesh file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nsm.domains.base import BoundedDomain, Domain
+from nsm.domains.embedding import Embedding
+from nsm.domains.planar_mesh import boundary_self_intersections, signed_areas
+from nsm.errors import NsmError
+from nsm.surfaces import topology
+from nsm.surfaces.cutting import Cut, seam_pairs, split_chords
+from nsm.surfaces.geometry import triangle_distortion
+from nsm.surfaces.seams import uv_seams
+from nsm.surfaces.validation import CleanMesh
+
+_KEY = "surface.parameterization"
+_ON_BOUNDARY = 1e-5  # single precision of a file
+
+
+def check_given(
+    uv: np.ndarray | None,
+    faces: np.ndarray,
+    domain: Domain,
+    seam: Sequence[int] | None,
+    name: str,
+) -> np.ndarray:
+    """Texture coordinates (F, 3, 2) of faces (F, 3), as a contiguous array.
+
+    Raises:
+        NsmError: ``missing_uv``: there are none for every corner; ``wrong_domain``: Ω has no
+            boundary; ``conflicting_settings``: seam vertices.
+    """
+    what = f"{name}: {_KEY}=given"
+    if not domain.has_boundary:
+        message = f"{what} needs a domain with boundary; take domain=disc or domain=square"
+        raise NsmError(message, kind="wrong_domain", key=_KEY)
+    if seam is not None:
+        message = f"{what} cuts along the texture coordinates; leave surface.seam_vertices out"
+        raise NsmError(message, kind="conflicting_settings", key="surface.seam_vertices")
+    if uv is None or np.shape(uv) != (len(faces), 3, 2) or not np.isfinite(uv).all():
+        message = f"{what}: not every face has texture coordinates; unwrap it, or take slim"
+        raise NsmError(message, kind="missing_uv", key=_KEY)
+    return np.ascontiguousarray(uv, dtype=np.float64)
+
+
+def cut_as_given(
+    mesh: CleanMesh, faces: np.ndarray, uv: np.ndarray, name: str
+) -> tuple[Cut, np.ndarray]:
+    """A mesh cut along the borders of its texture coordinates.
+
+    Args:
+        mesh: the cleaned mesh.
+        faces: (G, 3) of its file.
+        uv: (G, 3, 2) texture coordinates at their corners.
+        name: of the mesh, in messages.
+
+    Returns:
+        The disc, and the coordinates (V, 2) of its vertices, counter-clockwise.
+
+    Raises:
+        NsmError: ``unusable_uv``: several islands, holes, flipped triangles or overlaps, or a face
+            that the repair changed.
+    """
+
+    def unusable(reason: str) -> NsmError:
+        message = f"{name}: {_KEY}=given: the texture coordinates {reason}"
+        return NsmError(message, kind="unusable_uv", key=_KEY)
+
+    merged = mesh.merged[faces]
+    there = np.where(merged >= 0, mesh.source_vertex[merged], -1)
+    here = mesh.source_vertex[mesh.faces]
+    file_face, own_face = topology.equal_faces(there, here)
+    if len(own_face) < len(here):
+        lost = len(here) - len(own_face)
+        raise unusable(f"of {lost} faces are lost by the repair; take slim")
+    order = np.empty(len(here), dtype=np.int64)
+    order[own_face] = file_face
+    corner = (here[:, :, None] == there[order][:, None, :]).argmax(axis=2)
+    own = np.take_along_axis(uv[order], corner[:, :, None], axis=1)
+
+    edges = topology.edges_of(mesh.faces)
+    base = len(mesh.vertices)
+    seams = np.sort(uv_seams(mesh.faces, own), axis=1) @ [base, 1]
+    cut_faces, old = topology.cut_along(mesh.faces, np.isin(edges.pairs @ [base, 1], seams))
+    islands = int(topology.face_components(cut_faces).max()) + 1
+    if islands > 1:
+        raise unusable(f"have {islands} islands; flatten them one by one with task=param seams=uv")
+    if not topology.is_disc(cut_faces):
+        raise unusable("have holes, so that they are no disc; cut them open, or take slim")
+    flat = np.empty((len(old), 2))
+    flat[cut_faces] = own
+    areas = signed_areas(flat, cut_faces)
+    if areas.sum() < 0:  # a mirrored island
+        flat[:, 0] *= -1
+        areas = -areas
+    flipped = int((~(areas > 0)).sum())
+    if flipped:
+        raise unusable(f"flip {flipped} of {len(areas)} triangles; mend them, or take slim")
+    crossings = boundary_self_intersections(flat, topology.boundary_loops(cut_faces)[0])
+    if crossings:
+        raise unusable(f"overlap: their border crosses itself {crossings} times; take slim")
+    both, cut_faces, inserted = split_chords(np.hstack([mesh.vertices[old], flat]), cut_faces)
+    origin = np.concatenate([old, np.full(inserted, -1)])
+    loop = topology.boundary_loops(cut_faces)[0]
+    log = [f"cut along {len(np.unique(seams))} edges, as the texture coordinates are"]
+    points = np.ascontiguousarray(both[:, :3])
+    return Cut(points, cut_faces, origin, seam_pairs(origin), loop, tuple(log)), both[:, 3:]
+
+
+def embedded_as_given(domain: BoundedDomain, cut: Cut, uv: np.ndarray, name: str) -> Embedding:
+    """A disc laid out over Ω as it is laid out in the plane.
+
+    Coordinates that fill Ω, but for their place and the two axes' units, are kept. Others are taken
+    to Ω with least distortion, whatever the surface's own shape is.
+
+    Args:
+        domain: Ω.
+        cut: the disc.
+        uv: (V, 2) its coordinates, counter-clockwise and injective.
+        name: of the mesh, in messages.
+
+    Raises:
+        NsmError: ``not_injective``.
+    """
+    import torch
+
+    area = topology.face_areas(cut.vertices, cut.faces).sum()
+    vertices = cut.vertices * np.sqrt(domain.area / area)
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    filling = (2 * uv - low - high) / (high - low)
+    off = domain.signed_distance(torch.as_tensor(filling[cut.loop])).abs().max()
+    if float(off) < _ON_BOUNDARY:
+        filling[cut.loop] = domain.boundary_points(domain.boundary_fractions(filling[cut.loop]))
+        if (signed_areas(filling, cut.faces) > 0).all():
+            median = float(np.median(triangle_distortion(filling, vertices, cut.faces)))
+            line = "texture coordinates fill the domain: kept as they are"
+            return Embedding(filling, median, float("nan"), (line,))
+    scale = np.sqrt(domain.area / signed_areas(uv, cut.faces).sum())
+    plane = np.pad((uv - uv.mean(axis=0)) * scale, ((0, 0), (0, 1)))
+    flat = domain.embed(plane, cut.faces, name=name)
+    u, _, vt = np.linalg.svd(plane[:, :2].T @ flat.uv)
+    turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turned = flat.uv @ domain.nearest_rotation(torch.as_tensor(turn)).numpy().T
+    median = float(np.median(triangle_distortion(turned, vertices, cut.faces)))
+    line = f"texture coordinates taken to the domain, median distortion {flat.distortion:.2f}"
+    return Embedding(turned, median, float("nan"), (*flat.log, line))

@@ -1,0 +1,102 @@
+"""A periodic spline as a sum of levels from coarse to fine, odd on the orbifold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nsm.instantiation import target_of
+from nsm.maps.encodings import Identity, pushed_forward, transformed
+from nsm.maps.lattice_grid import LatticeSplineGrid
+
+_LEAST = 4  # cells
+# A coefficient is its parameter times this over √cells: the rate of feature grids behind a network
+# then suits, and a step of a fine level does not change slopes much more than that of a coarse one.
+_SCALE = 0.5
+
+
+class MultilevelSpline(nn.Module):
+    """n(x) = Σ n_l(x) on R²/(2Z)², uniform quadratic B-splines; zero at the start.
+
+    Each level has twice the cells of the one before, so that the sum is one spline on the finest
+    grid (two-scale relation): points see nine coefficients, whatever the number of levels. What
+    these are for is the training, where a step of a coarse level moves all around it.
+
+    Args:
+        out_dim: of the values.
+        cells: of the finest level along each axis, even.
+        odd: whether n(-x) = -n(x). The coefficients are then made odd, and n is evaluated once.
+
+    Raises:
+        ValueError: a parameter is out of range.
+    """
+
+    def __init__(self, out_dim: int = 2, cells: int = 128, odd: bool = False) -> None:
+        super().__init__()
+        if out_dim < 1 or cells < _LEAST or cells % 2:
+            raise ValueError("map.cells must be even and 4 or more, and out_dim positive")
+        self.out_dim, self.cells, self.odd = int(out_dim), int(cells), bool(odd)
+        sides = [self.cells]
+        while sides[0] % 2 == 0 and sides[0] // 2 >= _LEAST:
+            sides.insert(0, sides[0] // 2)
+        self.tables = nn.ParameterList(
+            nn.Parameter(torch.zeros(side, side, self.out_dim)) for side in sides
+        )
+        self._finest = LatticeSplineGrid([(self.cells, self.cells)], self.out_dim)
+        self._finest.tables = nn.ParameterList()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Settings from which :func:`nsm.maps.build_stored` makes it again."""
+        return {
+            "_target_": target_of(type(self)).replace(".multilevel_spline.", "."),
+            "out_dim": self.out_dim,
+            "cells": self.cells,
+            "odd": self.odd,
+        }
+
+    def coefficients(self) -> Tensor:
+        """(cells², ``out_dim``) of the sum of all levels, on the finest grid."""
+        levels = [_SCALE / len(table) ** 0.5 * table for table in self.tables]
+        c = levels[0]
+        for finer in levels[1:]:
+            c = _refined(_refined(c, 0), 1) + finer
+        if self.odd:
+            c = 0.5 * (c - c.flip(0, 1))  # x → -x takes cell i to cells - 1 - i
+        return c.flatten(0, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Points (..., 2) to values (..., ``out_dim``)."""
+        rows, (weights, _, _) = self._finest._seen(x.reshape(-1, 2))
+        blend = (_along(weights, 0)[:, None] * _along(weights, 1)[None]).flatten(0, 1)
+        seen = self.coefficients().index_select(0, rows[0].flatten())
+        out = (blend[:, :, None] * seen.view(*blend.shape, self.out_dim)).sum(dim=0)
+        return out.view(*x.shape[:-1], self.out_dim)
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (..., 2) to values (..., ``out_dim``) and Jacobians (..., ``out_dim``, 2)."""
+        points = x.reshape(-1, 2)
+        if transformed():
+            stack = pushed_forward(self, Identity(2).value_and_jacobian_stack(points))
+        else:
+            with torch.no_grad():
+                rows, orders = self._finest._seen(points)
+            stack = self._finest._blended(points, rows, orders, [self.coefficients()])
+        value, jacobian = stack[0], stack[1:].permute(1, 2, 0)
+        shape = (*x.shape[:-1], self.out_dim)
+        return value.reshape(shape), jacobian.reshape(*shape, 2)
+
+
+def _along(weights: list[Tensor], axis: int) -> Tensor:
+    """The weights (k, N) along an axis, of one level."""
+    return torch.stack([w[0, axis] for w in weights])
+
+
+def _refined(c: Tensor, axis: int) -> Tensor:
+    """Coefficients of the same periodic spline for cells half as long along an axis."""
+    near = 0.75 * c
+    first = near + 0.25 * c.roll(1, axis)
+    second = near + 0.25 * c.roll(-1, axis)
+    return torch.stack([first, second], dim=axis + 1).flatten(axis, axis + 1)

@@ -1,0 +1,123 @@
+"""task=param along given seams: one chart, or an atlas of several."""
+
+import re
+from xml.etree import ElementTree
+
+import networkx
+import numpy as np
+import pytest
+import trimesh
+from tiny import TRAINING
+
+import nsm
+from nsm.errors import NsmError
+from nsm.results.parameterization_atlas import ParameterizationAtlas
+from nsm.results.textured_mesh import TexturedMesh
+from nsm.surfaces import topology
+from nsm.surfaces.loading import load_mesh
+
+OWN = ("surface.path", "trainer.progress", "artefacts")
+TINY = [word for word in TRAINING if not word.startswith(OWN)]
+OF_PHI = [word for word in TINY if not word.startswith("surface")]
+WORDS = [*TINY, "phi.overrides=[" + ",".join(f"'{word}'" for word in OF_PHI) + "]"]
+
+
+def halves():
+    """A ball in millimetres, and texture coordinates in which its halves are islands."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces = 30 * np.asarray(ball.vertices), np.asarray(ball.faces)
+    upper = vertices[faces].mean(axis=1)[:, 2] > 0
+    uv = vertices[faces][:, :, :2] / 140 + np.where(upper, 0.25, 0.75)[:, None, None]
+    return vertices, faces, uv
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("atlas")
+    vertices, faces, uv = halves()
+    TexturedMesh(vertices, faces, uv, np.full((4, 4, 3), 9, np.uint8)).export(folder / "ball.obj")
+    atlas = nsm.parameterize(
+        folder / "ball.obj", seams="uv", overrides=WORDS, folder=folder / "run", progress=False
+    )
+    return folder / "run", atlas
+
+
+def test_islands_are_flattened_one_by_one_and_packed(run):
+    folder, atlas = run
+    assert isinstance(atlas, ParameterizationAtlas) and len(atlas.charts) == 2
+    for chart, uv in zip(atlas.charts, atlas.uv, strict=True):
+        assert chart.certificate["certified"]
+        assert uv.min() >= 0 and uv.max() <= 1
+        flat = chart.uv / chart.phi.surface.scale  # in the units of the file
+        assert np.allclose(uv - uv[0], atlas.scale * (flat - flat[0]))
+    assert set(atlas.metrics) == {"ball-0", "ball-1"}
+    again = nsm.load(folder)
+    assert isinstance(again, ParameterizationAtlas)
+    assert all(np.allclose(a, b) for a, b in zip(again.uv, atlas.uv, strict=True))
+
+
+def test_the_atlas_is_on_the_mesh_of_the_file(run):
+    folder, atlas = run
+    vertices, faces, _ = halves()
+    shown, own, _ = load_mesh(folder / "parameterized.obj")
+    assert np.allclose(shown, vertices, atol=1e-5)
+    assert {tuple(sorted(f)) for f in own.tolist()} == {tuple(sorted(f)) for f in faces.tolist()}
+    uv = nsm.surfaces.textures.read_uv(folder / "parameterized.obj")
+    places = np.concatenate(atlas.uv)
+    off = np.abs(uv.reshape(-1, 1, 2) - places[None]).max(axis=2).min(axis=1)
+    assert off.max() < 1e-6
+
+
+def test_the_pattern_shows_every_chart_in_units_of_the_file(run):
+    folder, atlas = run
+    root = ElementTree.parse(folder / "pattern.svg").getroot()
+    cuts = root.findall(".//{http://www.w3.org/2000/svg}path[@class='cut']")
+    assert len(cuts) == 2
+    drawn = []
+    for cut in cuts:
+        words = re.findall(r"\S+,\S+", cut.get("d"))
+        points = np.array([[float(x) for x in word.split(",")] for word in words])
+        drawn.append(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+    wanted = []
+    for chart in atlas.charts:
+        outline = chart.uv[topology.boundary_loops(chart.phi.surface.faces)[0]]
+        length = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).sum()
+        wanted.append(length / chart.phi.surface.scale)
+    assert sorted(drawn) == pytest.approx(sorted(wanted), rel=1e-5)
+
+
+def test_given_edges_cut_one_chart():
+    vertices, faces, _ = halves()
+    # down a side, from pole to pole
+    ends = [int(np.argmax(vertices @ d)) for d in ([0, 0, 1.0], [0, 0, -1.0])]
+    graph = trimesh.Trimesh(vertices, faces, process=False).vertex_adjacency_graph
+    path = networkx.shortest_path(graph, *ends)
+    pairs = [[int(a), int(b)] for a, b in zip(path, path[1:], strict=False)]
+    flat = nsm.parameterize((vertices, faces), seams=pairs, overrides=WORDS, progress=False)
+    cut = flat.phi.surface
+    assert {*cut.source_vertex[cut.seam_pairs.ravel()].tolist()} == set(path[1:-1])
+    assert any(f"cut along {len(pairs)} given edges" in line for line in cut.log)
+
+
+def test_seams_need_a_mesh(run):
+    _, atlas = run
+    with pytest.raises(NsmError) as refused:
+        nsm.parameterize(atlas.charts[0].phi, seams=[[0, 1]], overrides=WORDS, progress=False)
+    assert (refused.value.kind, refused.value.key) == ("conflicting_settings", "seams")
+
+
+def test_coordinates_of_a_file_are_the_start(here, tmp_path):
+    vertices, faces, uv = halves()
+    upper = vertices[faces].mean(axis=1)[:, 2] > 0
+    image = np.full((4, 4, 3), 9, np.uint8)
+    TexturedMesh(vertices, faces[upper], uv[upper], image).export(tmp_path / "half.obj")
+    TexturedMesh(vertices, faces, uv, image).export(tmp_path / "ball.obj")
+    words = [word for word in TINY if not word.startswith("surface.parameterization")]
+    words += ["surface.parameterization=given", "artefacts=false", "trainer.progress=false"]
+    run = here(*words, "surface=half.obj", "hydra.run.dir=run")
+    assert run.returncode == 0, run.stderr
+    assert "texture coordinates taken to the domain" in run.stdout
+    refused = here(*words, "surface=ball.obj")
+    assert refused.returncode == 2 and "2 islands" in refused.stderr
+    refused = here(*words, "surface=hemisphere")
+    assert refused.returncode == 2 and "texture coordinates" in refused.stderr
