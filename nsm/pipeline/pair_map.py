@@ -15,7 +15,7 @@ from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
-from nsm.maps import LatticeAligned, Remembered, Rotated
+from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
