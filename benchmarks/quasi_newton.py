@@ -1,8 +1,8 @@
-"""Maps between animals by quasi-Newton steps beside the default, from ready surfaces.
+"""Maps by quasi-Newton steps beside the default, from ready surfaces.
 
-    python benchmarks/quasi_newton.py --meshes FOLDER [--pairs 384-388 ...]
+    python benchmarks/quasi_newton.py --meshes FOLDER [--pairs 384-388 "381-393 disc" ...]
 
-Seconds are the CPU time of a map on one thread, with its certificate and figures; both ways of a
+Seconds are the CPU time of a map on one thread, with its certificate and figures; all ways of a
 pair run in turn in one process. What is in the file is kept.
 """
 
@@ -19,7 +19,11 @@ import torch
 import nsm
 
 RESULTS = Path(__file__).parent / "results" / "quasi_newton.json"
-WAYS = {"default": [], "fast": ["experiment=fast"]}
+WAYS = {
+    "default": [],
+    "preview": ["experiment=preview"],
+    "fast": ["experiment=fast"],
+}
 FIGURES = (
     *(f"symmetric_dirichlet_{k}" for k in ("median", "mean", "p95")),
     *("flipped_percent", "landmark_error_mean_percent", "landmark_error_max_percent", "certified"),
@@ -28,10 +32,11 @@ FIGURES = (
 
 def compared(meshes: Path, pair: str, known: dict[str, Any]) -> dict[str, Any]:
     """Seconds and figures of each way, from the neural surfaces of a pair; known ones are kept."""
+    pair, _, domain = pair.partition(" ")
     names = [f"shrec07-{name}" for name in pair.split("-")]
     files = [str(meshes / f"{name}.off") for name in names]
     marks = [str(meshes / "landmarks" / f"{name}.vts") for name in names]
-    short = ["trainer.max_steps=1", "certification.rounds=0"]
+    short = ["trainer.max_steps=1", "certification.rounds=0", f"domain={domain or 'auto'}"]
     ready = nsm.map_pair(*files, marks, overrides=short, progress=False)
     result: dict[str, Any] = {**known, "domain": str(ready.source.surface.domain)}
     for way, overrides in WAYS.items():
@@ -71,7 +76,7 @@ def table(known: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", type=Path, required=True)
-    parser.add_argument("--pairs", nargs="+", default=["384-388", "381-393", "388-381", "393-384"])
+    parser.add_argument("--pairs", nargs="+", default=["384-388", "302-314", "381-393 disc"])
     given = parser.parse_args()
     torch.set_num_threads(1)
     known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}

@@ -323,8 +323,9 @@ class TrainerSettings:
             hardware has them.
         compile: compile the evaluation of the networks: half a minute at the start, then faster
             steps; without a compiler nothing changes.
-        tabulated: cells a side of a table that stands for the target of a pair map in the
-            training; figures are those of the mesh. null: the target's network itself.
+        tabulated: cells a side of the tables that stand, in the training, for the surfaces at
+            whose points a map arrives; figures are those of the mesh. null: the networks
+            themselves.
         progress: show a progress bar.
         gradient_clip: largest norm of a step's gradient; null: no limit.
         log_every: steps between two values in the logs.
@@ -401,10 +402,16 @@ class ParamConstraints(Checked):
         boundary: free; or fixed: h keeps to the domain by construction and its boundary slides,
             so that the map is bijective.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
+        injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
+            areas at samples that are near to it, for quasi-Newton steps.
+        triangles_from: share of the steps after which the training measures distortion at triangles
+            of the source's mesh, as figures do, instead of samples.
     """
 
     boundary: Literal["free", "fixed"]
     fold_every: Count = 25
+    injectivity: Literal["exponential", "smooth"] = "exponential"
+    triangles_from: Share = 1.0
 
 
 @dataclass(frozen=True)
@@ -416,19 +423,28 @@ class PairConstraints(Checked):
             the boundary to ∂Ω.
         landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
         multiplier_every: steps between two updates of the multipliers.
-        ramp: share of the steps over which the weights of landmarks and seam rise to their values.
+        ramp: share of the steps over which landmarks and the seam come into full effect.
+        ramp_of: what the ramp moves of the landmarks: targets, from where h has them at its start;
+            or weights: λ_C grows from a thousandth.
         fold_margin: what the determinant of J_h must stay above at the mesh triangles.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         multipliers_from: share of the steps before the multipliers' first update.
+        injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
+            areas at samples that are near to it, for quasi-Newton steps.
+        triangles_from: share of the steps after which the training measures distortion at triangles
+            of the source's mesh, as figures do, instead of samples.
     """
 
     boundary: Literal["exact", "penalty"]
     landmarks: Literal["augmented", "fixed"]
     ramp: Share
+    ramp_of: Literal["targets", "weights"] = "targets"
     multiplier_every: Count = 50
     fold_margin: Share = 0.1
     fold_every: Count = 25
     multipliers_from: Share = 0.0
+    injectivity: Literal["exponential", "smooth"] = "exponential"
+    triangles_from: Share = 1.0
 
 
 @dataclass(frozen=True)
@@ -444,6 +460,11 @@ class CollectionConstraints(PairConstraints):
         fold_margin: what the determinant of J_h must stay above at the mesh triangles.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         multipliers_from: share of the steps before the multipliers' first update.
+        ramp_of: what the ramp moves of the landmarks: targets, from where h_i has them at its
+            start; or weights: λ_C grows from a thousandth.
+        injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
+            det J_h at samples that are near to it, for quasi-Newton steps.
+        triangles_from: of task=pair_map alone.
         pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
             mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.
     """

@@ -156,7 +156,11 @@ def rows(text):
     ("page", "heading", "files"),
     [
         ("maps", "## Measurements", ["maps.md"]),
-        ("optimization", "## Error over time", ["overfit.md", "steps.md", "quasi_newton.md"]),
+        (
+            "optimization",
+            "## Error over time",
+            ["overfit.md", "steps.md", "quasi_newton.md", "quasi_newton_trials.md"],
+        ),
         ("activations", "| activation |", ["activation.md"]),
         ("robustness", "<!-- table -->", ["torture.md"]),
         ("paper", "## The published settings", ["maps.md", "published-reduced.md"]),

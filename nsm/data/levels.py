@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import accumulate
 
+from torch import Tensor
+
+from nsm.data.collection import CollectionData
 from nsm.data.sampler import Draws
 from nsm.data.sampling import Samples
 from nsm.data.surface import SurfaceData
 from nsm.domains import Surface
+from nsm.maps import LatticeAligned, Rotated
 from nsm.settings import Count
 
 
@@ -37,11 +41,7 @@ class LevelData(SurfaceData):
         held_out: Count = 16_384,
         seed: int = 0,
     ) -> None:
-        if len(steps) != len(points) - 1 or min(points, default=0) < 1 or min(steps, default=0) < 0:
-            raise ValueError(
-                "data.points has one number, 1 or more, per level; data.steps one, 0 or more, per "
-                "level but the last"
-            )
+        _check(points, steps)
         super().__init__(
             surface,
             sampler,
@@ -61,3 +61,58 @@ class LevelData(SurfaceData):
             whole = self.own_sampler.draw(self.points, self.counts[level], generator)
             self._drawn = level, Samples(*(self.part.of_rows(rows) for rows in whole))
         return self._drawn[1]
+
+
+class CollectionLevelData(CollectionData):
+    """As :class:`LevelData`, samples of several surfaces in their common domain.
+
+    Args:
+        surfaces, starts, sampler: as for :class:`nsm.data.CollectionData`.
+        points: in the batch of each level, of all surfaces together.
+        steps: of each level but the last, which lasts until the end.
+        steps_per_epoch, held_out, seed: as for :class:`nsm.data.CollectionData`.
+
+    Raises:
+        ValueError: as for :class:`LevelData`.
+    """
+
+    def __init__(
+        self,
+        surfaces: Sequence[Surface],
+        starts: Sequence[Rotated | LatticeAligned],
+        sampler: Draws | None = None,
+        *,
+        points: Sequence[int],
+        steps: Sequence[int],
+        steps_per_epoch: Count = 250,
+        held_out: Count = 8192,
+        seed: int = 0,
+    ) -> None:
+        _check(points, steps)
+        super().__init__(
+            surfaces,
+            starts,
+            sampler,
+            batch_size=points[-1],
+            steps_per_epoch=steps_per_epoch,
+            held_out=held_out,
+            seed=seed,
+        )
+        self.counts, self.ends = list(points), list(accumulate(steps))
+        self._drawn: tuple[int, Tensor] | None = None
+
+    def batch(self, step: int) -> Tensor:
+        """The samples (N, 2) of a step's level; of several processes, this one's share of them."""
+        level = sum(step >= end for end in self.ends)
+        if self._drawn is None or self._drawn[0] != level:
+            self.share = max(1, self.counts[level] // len(self.surfaces))
+            self._drawn = level, super().batch(level)
+        return self._drawn[1]
+
+
+def _check(points: Sequence[int], steps: Sequence[int]) -> None:
+    if len(steps) != len(points) - 1 or min(points, default=0) < 1 or min(steps, default=0) < 0:
+        raise ValueError(
+            "data.points has one number, 1 or more, per level; data.steps one, 0 or more, per "
+            "level but the last"
+        )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -69,32 +71,35 @@ class SplineField(nn.Module):
         out_dim: of the values.
         cells: along each axis.
         periodic: on the torus R²/(2Z)²; else points outside the square count as the nearest in it.
+        odd: n(-x) = -n(x), of a periodic one of an even number of cells.
 
     Attributes:
-        coefficients: (side², ``out_dim``), side = cells + 2, or cells if periodic.
+        coefficients: (rows, ``out_dim``): side² of them, side = cells + 2, or cells if periodic;
+            if odd, half of them.
 
     Raises:
         ValueError: a parameter is out of range.
     """
 
-    def __init__(self, out_dim: int = 2, cells: int = 8, periodic: bool = False) -> None:
+    def __init__(
+        self, out_dim: int = 2, cells: int = 8, periodic: bool = False, odd: bool = False
+    ) -> None:
         super().__init__()
         if out_dim < 1 or cells < 3:
             raise ValueError("map.cells must be 3 or more, and out_dim positive")
-        self.periodic, self.out_dim = bool(periodic), int(out_dim)
-        side = cells if periodic else cells + _DEGREE
-        self.coefficients = nn.Parameter(torch.zeros(side * side, out_dim))
+        if odd and (cells % 2 or not periodic):
+            raise ValueError("an odd spline is periodic; map.cells must be even")
+        self.periodic, self.odd = bool(periodic), bool(odd)
+        self.out_dim, self.cells = int(out_dim), int(cells)
+        rows = self.side**2 // (2 if odd else 1)
+        self.coefficients = nn.Parameter(torch.zeros(rows, out_dim))
         self._recent: list[_Weights] = []
+        self._watched: list[tuple[Tensor, Tensor]] | None = None
 
     @property
     def side(self) -> int:
         """Coefficients along each axis."""
-        return round(len(self.coefficients) ** 0.5)
-
-    @property
-    def cells(self) -> int:
-        """Cells along each axis."""
-        return self.side if self.periodic else self.side - _DEGREE
+        return self.cells if self.periodic else self.cells + _DEGREE
 
     @property
     def config(self) -> dict[str, Any]:
@@ -104,13 +109,19 @@ class SplineField(nn.Module):
             "out_dim": self.out_dim,
             "cells": self.cells,
             "periodic": self.periodic,
+            "odd": self.odd,
         }
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_recent": []}
 
-    def _seen(self, x: Tensor, tangents: bool) -> tuple[Tensor, Tensor]:
-        """Rows (N, 9) of the coefficients that points see, and their weights (P, N, 9)."""
+    def seen(self, x: Tensor, tangents: bool) -> tuple[Tensor, Tensor]:
+        """What points (N, 2) see of the coefficients.
+
+        Returns:
+            Rows (N, 9), and their weights (P, N, 9) for the value and, with ``tangents``, for both
+            derivatives: P is 1 or 3.
+        """
         cells = self.cells
         z = (x.t() + 1) * (0.5 * cells)
         cell = z.detach().floor()
@@ -128,19 +139,38 @@ class SplineField(nn.Module):
             d = slopes * ((offset == free) * (0.5 * cells))[..., None]
             orders += [(d[0], w[1]), (w[0], d[1])]
         weights = torch.stack([u[:, :, None] * v[:, None, :] for u, v in orders])
+        if self.odd:  # the second half of the coefficients is the first, turned and negative
+            turned = rows >= self.side**2 // 2
+            rows = torch.where(turned, self.side**2 - 1 - rows, rows)
+            weights = torch.where(turned, -weights, weights)
         return rows.flatten(1), weights.flatten(2)
+
+    @contextmanager
+    def watched(self) -> Iterator[list[tuple[Tensor, Tensor]]]:
+        """Gather what is evaluated: points (N, 2), and their values with both tangents (3, N,
+        out_dim), from which gradients are wanted instead of from the coefficients."""
+        self._watched = []
+        try:
+            yield self._watched
+        finally:
+            self._watched = None
 
     def _evaluated(self, x: Tensor, tangents: bool) -> Tensor:
         """Value and perhaps both tangents at points (..., 2): (P, ..., out_dim)."""
         points = x.reshape(-1, 2).to(self.coefficients.dtype)
         planes = 3 if tangents else 1
-        if points.requires_grad or transformed() or torch.compiler.is_compiling():
-            rows, weights = self._seen(points, tangents)
+        if self._watched is not None:
+            rows, weights = self.seen(points, tangents)
+            out = _sums(self.coefficients.detach(), rows.repeat(planes, 1), weights.flatten(0, 1))
+            out = out.view(planes, len(points), -1).requires_grad_()
+            self._watched.append((points, out))
+        elif points.requires_grad or transformed() or torch.compiler.is_compiling():
+            rows, weights = self.seen(points, tangents)
             out = (weights[..., None] * self.coefficients[rows]).sum(dim=-2)
         elif torch.is_grad_enabled() and self.coefficients.requires_grad:
             out = _Product.apply(self.coefficients, self._weights(points, tangents))
         else:
-            rows, weights = self._seen(points, tangents)
+            rows, weights = self.seen(points, tangents)
             out = _sums(self.coefficients, rows.repeat(planes, 1), weights.flatten(0, 1))
         return out.view(planes, *x.shape[:-1], self.out_dim)
 
@@ -151,7 +181,7 @@ class SplineField(nn.Module):
             if known.planes == planes and known.x.device == x.device and torch.equal(known.x, x):
                 self._recent.append(self._recent.pop(at))
                 return known
-        made = _Weights(x.clone(), *self._seen(x, tangents), len(self.coefficients))
+        made = _Weights(x.clone(), *self.seen(x, tangents), len(self.coefficients))
         if len(x) <= _MOST:
             self._recent = [*self._recent[1 - _KEPT :], made]
         return made

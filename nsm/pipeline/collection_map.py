@@ -185,7 +185,7 @@ class CollectionMapTask(Task):
             starts=self.starts,
             mesh=self._mesh(),
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
-            phis=[phi.map for phi in self.phis],
+            phis=[self.tabulated(phi) for phi in self.phis],
             names=names if len(set(names)) == len(names) else None,
         )
 

@@ -15,7 +15,7 @@ from nsm.data import SurfaceData
 from nsm.domains.joint_preparation import matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
-from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated, Tabulated
+from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
@@ -145,12 +145,9 @@ class PairMapTask(Task):
 
     def _for_training(self) -> tuple[torch.nn.Module, torch.nn.Module]:
         """φ and ψ as the training evaluates them."""
-        cells, psi = self.config.trainer.tabulated, self.psi.map
-        if cells is None:
-            return self.phi.map, psi
-        if not isinstance(psi, AnalyticSurface):  # whose formulas are as fast
-            psi = Tabulated(psi, cells, periodic=not self.domain.has_boundary)
-        return Remembered(self.phi.map), psi
+        if self.config.trainer.tabulated is None:
+            return self.phi.map, self.psi.map
+        return Remembered(self.phi.map), self.tabulated(self.psi)
 
     def _start(self, p: torch.Tensor, q: torch.Tensor) -> Rotated | LatticeAligned:
         """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)

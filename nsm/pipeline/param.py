@@ -12,6 +12,7 @@ import torch
 
 from nsm.data import SurfaceData
 from nsm.domains.baselines import BASELINES
+from nsm.maps import Remembered
 from nsm.pipeline.charts import neural_charts
 from nsm.pipeline.surface_cache import neural_surface
 from nsm.pipeline.task import Given, Task, frozen
@@ -91,7 +92,12 @@ class ParamTask(Task):
             torch.as_tensor(surface.faces),
             torch.as_tensor(areas, dtype=torch.float32),
         )
-        return self.module(**self.map_settings(), mesh=mesh, phi=self.phi.map)
+        return self.module(**self.map_settings(), mesh=mesh, phi=self._for_training())
+
+    def _for_training(self) -> torch.nn.Module:
+        """φ as the training evaluates it."""
+        kept = self.config.trainer.tabulated is not None
+        return Remembered(self.phi.map) if kept else self.phi.map
 
     def make_result(self, module: Any) -> Parameterization:
         return Parameterization(self.phi, frozen(module.map), {}, self.settings)

@@ -19,8 +19,10 @@ from rich.text import Text
 from nsm.domains import Surface, domain
 from nsm.errors import NsmError
 from nsm.instantiation import made, made_with
+from nsm.maps import AnalyticSurface, Tabulated
 from nsm.pipeline.automatic_domain import choose_domain, is_automatic
 from nsm.pipeline.training import plain
+from nsm.results import NeuralSurface
 from nsm.results.meshes import ColouredMesh
 from nsm.tasks.training import Training
 
@@ -194,6 +196,13 @@ class Task:
             self.data_settings, **inputs, sampler=sampler, seed=self.config.seed
         )
         return data
+
+    def tabulated(self, surface: NeuralSurface) -> torch.nn.Module:
+        """A surface whose points move in the training, as that evaluates it."""
+        cells = self.config.trainer.tabulated
+        if cells is None or isinstance(surface.map, AnalyticSurface):  # whose formulas are as fast
+            return surface.map
+        return Tabulated(surface.map, cells, periodic=not self.domain.has_boundary)
 
     def begin_again(self, module: Any) -> bool:
         """Whether a trained module shows that another start is needed; the settings then have it.

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
+from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.settings import CollectionConstraints
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
@@ -104,13 +106,13 @@ class CollectionMap(ConstrainedMap):
         return every
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
-        w, ramp, k = self.loss_weights, self.ramp, len(self.map)
-        summed = self.constraints.pairs == "sum"
-        pairs, scale = (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
+        self.batch = batch
+        w, ramp = self.loss_weights, self.ramp
+        pairs, scale = self._scales()
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
-        G = injectivity(evaluation.determinant).mean(dim=1).sum()
+        G = self.folds.of_plane(evaluation.determinant).mean(dim=1).sum()
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self._triangle_term() if w.triangles > 0 else 0.0
@@ -122,7 +124,7 @@ class CollectionMap(ConstrainedMap):
             + w.boundary * B
             + ramp * w.seam * S
             + w.triangles * U
-            + w.landmarks * C
+            + self.landmark_weight * C
         )
         terms: dict[str, Term] = {
             **{name: (pairs * weight, E) for name, (weight, E) in distortion.terms.items()},
@@ -131,7 +133,7 @@ class CollectionMap(ConstrainedMap):
             "boundary": (scale * w.boundary, B),
             "seam": (scale * ramp * w.seam, S),
             "triangles": (scale * w.triangles, U),
-            "landmarks": (scale * w.landmarks, C),
+            "landmarks": (scale * self.landmark_weight, C),
         }
         for name, term in self.loss_terms.items():
             terms[name] = (term.weight, term(evaluation))
@@ -145,15 +147,58 @@ class CollectionMap(ConstrainedMap):
         forms, determinants, images, positions = (
             part.transpose(0, 1) for part in self.pointwise(self._at, x)
         )
-        # samples lie by the mean of the surfaces' areas: weights make it that of each source
-        area = torch.linalg.det(forms.detach()).clamp(min=0).sqrt()
-        share = area / area.mean(dim=0).clamp(min=1e-12)
-        if not self.exact:  # samples that a map sends out of Ω do not count
-            share = share * inside(self.domain, images.detach()).all(dim=0)
+        share = self._shares(forms.detach(), images.detach())
         i, j = self.ordered
         parts = self.energy.parts(forms[i], forms[j], At(images[i], positions[i]))
         evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
         return Distortion(self.energy, parts, share[i]), evaluation
+
+    def _scales(self) -> tuple[int, float]:
+        """The weights of the mean over the pairs, and of the sums over the surfaces."""
+        k = len(self.map)
+        summed = self.constraints.pairs == "sum"
+        return (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
+
+    def _shares(self, forms: Tensor, images: Tensor) -> Tensor:
+        """How much each sample counts for each source, (k, N).
+
+        Samples lie by the mean of the surfaces' areas: weights make it that of each source.
+        """
+        area = torch.linalg.det(forms).clamp(min=0).sqrt()
+        share = area / area.mean(dim=0).clamp(min=1e-12)
+        if not self.exact:  # samples that a map sends out of Ω do not count
+            share = share * inside(self.domain, images).all(dim=0)
+        return share
+
+    def curvatures(self) -> list[Curvature]:
+        x, w, k = self.batch, self.loss_weights, len(self.map)
+        pairs, scale = self._scales()
+        with torch.no_grad():
+            images, inner = batched(list(self.map)).value_and_jacobian(x.expand(k, -1, -1))
+            positions, outer = batched(list(self.phis)).value_and_jacobian(images)
+            forms = first_fundamental_form(outer @ inner)
+            share = self._shares(forms, images).double()
+            share *= pairs / (share.sum(dim=1, keepdim=True).clamp(min=1e-12) * k * (k - 1))
+
+        def energy(i: int, j: Tensor) -> Tensor:
+            """The part of the loss at each sample that the map of surface i has."""
+            own = first_fundamental_form(outer[i].double() @ j)
+            total = scale * w.injectivity / len(x) * self.folds.of_plane(torch.linalg.det(j))
+            for other in (n for n in range(k) if n != i):
+                there, here = At(images[i], positions[i]), At(images[other], positions[other])
+                to = self.energy.total(self.energy.parts(own, forms[other], there))
+                back = self.energy.total(self.energy.parts(forms[other], own, here))
+                total = total + share[i] * to + share[other] * back
+            return total
+
+        of_landmarks = 2 * scale * self.landmark_weight * torch.eye(2).to(x)
+        found = []
+        for i, h in enumerate(self.map):
+            found.append(Curvature(h, x, positive_hessians(partial(energy, i), inner[i])))
+            if len(self.points):
+                each = self.there[i].to(x)[:, None, None] * of_landmarks
+                found.append(Curvature(h, self.points, each))
+        return found
 
     def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A_i (N, k, 2, 2), det J_h (N, k), h (N, k, 2) and φ∘h (N, k, 3) of all surfaces at points

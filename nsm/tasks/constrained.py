@@ -9,12 +9,14 @@ from torch import Tensor
 
 from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
-from nsm.tasks.fold_barrier import further_training, stronger
+from nsm.tasks.fold_barrier import Folds, further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
 
 # float32 places a point of the boundary no better than this
 _ON_BOUNDARY = 1e-6
+# share of λ_C with which the ramp of the weights begins
+_FIRST = 1e-3
 
 
 class ConstrainedMap(Training):
@@ -26,8 +28,9 @@ class ConstrainedMap(Training):
     ``constraints.landmarks=augmented``, multipliers are updated every ``multiplier_every`` steps
     once the ramp is over (augmented Lagrangian), so that landmarks are met whatever λ_C is; with
     ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the landmarks' targets move
-    from where h has them at its start to their places, and the seam's weight grows from zero: with
-    the full terms at once, h would fold.
+    from where h has them at its start to their places (``constraints.ramp_of=targets``) or λ_C
+    grows from a thousandth (``weights``), and the seam's weight grows from zero: with the full
+    terms at once, h would fold.
 
     Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
     ``landmark_error``.
@@ -68,6 +71,7 @@ class ConstrainedMap(Training):
         self.loss_weights = PairWeights(**loss_weights)
         self.constraints = self.Constraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
+        self.folds = Folds(self.constraints.injectivity)
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
@@ -95,13 +99,21 @@ class ConstrainedMap(Training):
         """From 0 to 1: how far the landmarks' targets and the seam's weight have come."""
         return min(1.0, self.global_step / self.ramp_steps) if self.ramp_steps else 1.0
 
+    @property
+    def landmark_weight(self) -> float:
+        """λ_C, as far as it has risen on the ramp."""
+        raised = self.constraints.ramp_of == "weights"
+        return self.loss_weights.landmarks * (_FIRST ** (1 - self.ramp) if raised else 1.0)
+
     def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
-        """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target on the ramp,
-        over the landmarks that there are; 0.0 where there are none."""
+        """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target, which may
+        move on the ramp, over the landmarks that there are; 0.0 where there are none."""
         if not len(self.points):
             return 0.0, 0.0
         moved = self(self.points)
-        wanted = self.start + self.ramp * (self.targets - self.start)
+        wanted = self.targets
+        if self.constraints.ramp_of == "targets":
+            wanted = self.start + self.ramp * (self.targets - self.start)
         multipliers: Tensor | float = 0.0
         C = (self.there * landmark(moved, wanted)).sum()
         if self.constraints.landmarks == "augmented":

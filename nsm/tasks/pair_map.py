@@ -8,10 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import At, boundary, first_fundamental_form, injectivity, inside, outside
+from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.constrained import ConstrainedMap
+from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
+from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
 
@@ -72,6 +74,9 @@ class PairMap(ConstrainedMap):
         self.image = Composition(self.psi, self.map)
         held = self.constraints
         self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
+        self.quadrature, self.triangles_from = None, held.triangles_from * max_steps
+        if held.triangles_from < 1:
+            self.quadrature = MeshQuadrature(*mesh, self.phi)
         self.diagonal = diagonal
         self.set_landmarks(points, targets, self.map.before(points), seam)
 
@@ -80,10 +85,11 @@ class PairMap(ConstrainedMap):
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        self.batch = batch
         w, ramp = self.loss_weights, self.ramp
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
-        G = injectivity(evaluation.determinant).mean()
+        G = self._folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
@@ -96,7 +102,7 @@ class PairMap(ConstrainedMap):
             + w.boundary * B
             + ramp * w.seam * S
             + w.triangles * U
-            + w.landmarks * C
+            + self.landmark_weight * C
         )
         terms: dict[str, Term] = {
             **distortion.terms,
@@ -105,7 +111,7 @@ class PairMap(ConstrainedMap):
             "boundary": (w.boundary, B),
             "seam": (ramp * w.seam, S),
             "triangles": (w.triangles, U),
-            "landmarks": (w.landmarks, C),
+            "landmarks": (self.landmark_weight, C),
         }
         for name, term in self.loss_terms.items():
             terms[name] = (term.weight, term(evaluation))
@@ -113,16 +119,40 @@ class PairMap(ConstrainedMap):
         self.log_terms(loss, terms, distortion=energy)
         return loss
 
+    def _folding(self, e: Evaluation) -> Tensor:
+        """G: the mean over samples, or triangles by their area."""
+        assert e.source is not None and e.target is not None
+        values = self.folds(e.determinant, e.source, e.target, self.global_step)
+        return values.mean() if e.share is None else (e.share * values).sum()
+
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples of the source, and what it is made from."""
+        if self.training and (some := self._triangles(batch)) is not None:
+            return self._on_triangles(some)
         A, B, jacobian, h = self.pointwise(self._at, batch.uv)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         if not self.exact:  # samples that h maps out of Ω do not count
             kept = inside(self.domain, h)
             parts = {name: part[kept] for name, part in parts.items()}
         det = torch.linalg.det(jacobian)
-        self.least_determinant = det.detach().min()
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
+
+    def _triangles(self, batch: Samples) -> Triangles | None:
+        """Those at which the distortion of a training step is measured; None: it is at samples."""
+        if self.quadrature is None or self.global_step < self.triangles_from:
+            return None
+        return self.quadrature.take(len(batch.uv))
+
+    def _on_triangles(self, some: Triangles) -> tuple[Distortion, Evaluation]:
+        """The energy of the map that is linear on triangles of the source."""
+        h = self.map(some.uv)
+        A, B = some.metric, first_fundamental_form(some.sides(self.psi(h)))
+        centre = some.points[some.faces].mean(dim=1)
+        parts = self.energy.parts(A, B, At(some.centres, centre))
+        det = torch.linalg.det(some.sides(h)) / some.determinant
+        image = h[some.faces].mean(dim=1)
+        evaluation = Evaluation(some.centres, centre, image, A, B, det, some.oriented)
+        return Distortion(self.energy, parts, some.share), evaluation
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A, B, J_h and h at points (N, 2) of Ω."""
@@ -131,6 +161,38 @@ class PairMap(ConstrainedMap):
         image, jacobian = self.map.value_and_jacobian(uv)
         _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
         return source, first_fundamental_form(outer @ jacobian), jacobian, image
+
+    def curvatures(self) -> list[Curvature]:
+        uv, position, w = self.batch.uv, self.batch.points, self.loss_weights
+        share = uv.new_full((len(uv),), 1 / len(uv))
+        if (some := self._triangles(self.batch)) is not None:  # nearly theirs
+            uv, share, position = some.centres, some.share, some.points[some.faces].mean(dim=1)
+        at = At(uv, position)
+        with torch.no_grad():
+            source, _, jacobian, image = self._at(uv)
+            outer = self.psi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
+
+        def energy(j: Tensor) -> Tensor:
+            target = first_fundamental_form(outer @ j)
+            values = self.energy.total(self.energy.parts(source, target, at))
+            folds = self.folds(torch.linalg.det(j), source, target, self.global_step)
+            return values + w.injectivity * folds
+
+        hessians = share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        found = [Curvature(self.map, uv, hessians)]
+        if len(self.points):
+            of_landmarks = 2 * self.landmark_weight * torch.eye(2).to(uv)
+            found.append(
+                Curvature(self.map, self.points, of_landmarks.expand(len(self.points), 2, 2))
+            )
+        if len(self.seam) and w.seam > 0:
+            ends = self.seam.reshape(-1, 2)
+            with torch.no_grad():
+                tangents = self.psi.value_and_jacobian(self.map(ends))[1]  # type: ignore[operator]
+            # of both ends of a gap alone, without the product of the two
+            gap = 2 * self.ramp * w.seam / len(self.seam) * first_fundamental_form(tangents)
+            found.append(Curvature(self.map, ends, gap))
+        return found
 
     def _boundary_term(self, image: Tensor) -> Tensor:
         """Mean squared distance of h(∂Ω) to ∂Ω, and of samples outside Ω to Ω."""

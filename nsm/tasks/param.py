@@ -8,9 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from nsm.data import Samples
-from nsm.energies import At, first_fundamental_form, injectivity
+from nsm.energies import At, first_fundamental_form
 from nsm.settings import ParamConstraints, ParamWeights
-from nsm.tasks.fold_barrier import FoldBarrier, further_training, stronger
+from nsm.tasks.curvature import Curvature, positive_hessians
+from nsm.tasks.fold_barrier import FoldBarrier, Folds, further_training, stronger
+from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
 from nsm.tasks.training import Training
@@ -61,12 +63,15 @@ class Param(Training):
         self.save_hyperparameters(ignore=["domain", "energy", "phi", "mesh"], logger=False)
         self.loss_weights = ParamWeights(**loss_weights)
         held = ParamConstraints(**constraints)
-        fixed = held.boundary == "fixed"
+        fixed, self.folds = held.boundary == "fixed", Folds(held.injectivity)
         self.map = planar_map(domain if fixed else None, map, activation, encoding)
         self.energy = as_blend(energy)
         self.loss_terms = made_terms(loss_terms or {})
         self.phi = phi.eval().requires_grad_(False)
         self.fold_barrier = FoldBarrier(*mesh, every=held.fold_every)
+        self.quadrature, self.triangles_from = None, held.triangles_from * max_steps
+        if held.triangles_from < 1:
+            self.quadrature = MeshQuadrature(*mesh[:2], self.phi)
         self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
@@ -74,10 +79,11 @@ class Param(Training):
         return self.map(uv)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        self.batch = batch
         w = self.loss_weights
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
-        G = injectivity(evaluation.determinant).mean()
+        G = self._folding(evaluation)
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
 
         loss = energy + w.injectivity * G + w.triangles * U
@@ -92,14 +98,39 @@ class Param(Training):
         self.log_terms(loss, terms, distortion=energy)
         return loss
 
+    def _folding(self, e: Evaluation) -> Tensor:
+        """G: the mean over samples, or triangles by their area."""
+        assert e.source is not None and e.target is not None
+        values = self.folds(e.determinant, e.source, e.target, self.global_step)
+        return values.mean() if e.share is None else (e.share * values).sum()
+
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples, and what it is made from; φ's part is not recorded."""
+        if self.training and (some := self._triangles(batch)) is not None:
+            return self._on_triangles(some)
         A, jacobian, h = self.pointwise(self._at, batch.uv)
         B = first_fundamental_form(jacobian)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         det = torch.linalg.det(jacobian)
-        self.least_determinant = det.detach().min()
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
+
+    def _triangles(self, batch: Samples) -> Triangles | None:
+        """Those at which the distortion of a training step is measured; None: it is at samples."""
+        if self.quadrature is None or self.global_step < self.triangles_from:
+            return None
+        return self.quadrature.take(len(batch.uv))
+
+    def _on_triangles(self, some: Triangles) -> tuple[Distortion, Evaluation]:
+        """The energy of the map that is linear on triangles."""
+        h = self.map(some.uv)
+        sides = some.sides(h)
+        A, B = some.metric, first_fundamental_form(sides)
+        centre = some.points[some.faces].mean(dim=1)
+        parts = self.energy.parts(A, B, At(some.centres, centre))
+        det = torch.linalg.det(sides) / some.determinant
+        image = h[some.faces].mean(dim=1)
+        evaluation = Evaluation(some.centres, centre, image, A, B, det, some.oriented)
+        return Distortion(self.energy, parts, some.share), evaluation
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A, J_h and h at points (N, 2) of Ω."""
@@ -107,6 +138,24 @@ class Param(Training):
             source = first_fundamental_form(self.phi.value_and_jacobian(uv)[1])  # type: ignore[operator]
         h, jacobian = self.map.value_and_jacobian(uv)
         return source, jacobian, h
+
+    def curvatures(self) -> list[Curvature]:
+        uv, position, w = self.batch.uv, self.batch.points, self.loss_weights
+        share = uv.new_full((len(uv),), 1 / len(uv))
+        if (some := self._triangles(self.batch)) is not None:  # nearly theirs
+            uv, share, position = some.centres, some.share, some.points[some.faces].mean(dim=1)
+        at = At(uv, position)
+        with torch.no_grad():
+            source, jacobian, _ = self._at(uv)
+
+        def energy(j: Tensor) -> Tensor:
+            target = first_fundamental_form(j)
+            values = self.energy.total(self.energy.parts(source, target, at))
+            folds = self.folds(torch.linalg.det(j), source, target, self.global_step)
+            return values + w.injectivity * folds
+
+        hessians = share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        return [Curvature(self.map, uv, hessians)]
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""

@@ -40,7 +40,7 @@ def planar_map(
                 finest = max(4, int(np.max(encoding.get("resolutions", periodic["resolutions"]))))
                 return domain.equivariant(MultilevelSpline(2, finest + finest % 2, domain.even))
             if kind is SplineField:
-                map = {**map, "periodic": True}
+                map = {**map, "periodic": True, "odd": domain.even}
         encoding = periodic
     if kind is PlanarNetwork:
         map = {**map, "_target_": target_of(NeuralMap)}

@@ -1,44 +1,61 @@
-"""L-BFGS in Sobolev coordinates on the coefficients of splines, coarse levels first (METHOD)."""
+"""Quasi-Newton steps on the coefficients of splines, coarse levels first (METHOD)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
 from nsm.maps import SplineField
-from nsm.tasks.sobolev import Level
+from nsm.tasks.curvature import Curvature
+from nsm.tasks.spline_level import Level, Metric
 
-_SUFFICIENT = 1e-4  # Armijo: share of the decrease that the slope promises
-_TRIALS = 12
-_Found = tuple[Any, Tensor, float]  # loss, gradient on the level, and least det J_h
-_FLAT = 1e-10  # curvature relative to the lengths of step and change under which it is noise
+_SUFFICIENT = 1e-4  # Armijo's condition
+_TRIALS = 8
+_FLAT = 1e-10  # pairs of less curvature say nothing
+# largest change of a coefficient in the first iteration of a step without known curvature
+_FIRST = 0.02
+
+
+class _Found(NamedTuple):
+    """Loss and gradient on the level."""
+
+    loss: Any
+    value: float
+    gradient: np.ndarray
 
 
 class QuasiNewton(Optimizer):
-    """Each step makes several iterations of L-BFGS on one batch, whose loss must stay the same.
+    """L-BFGS on the coefficients of splines, from the curvature of the loss at its points.
 
-    On a level of n cells h's displacement is restricted to the splines of n × n cells, which are
-    among those of the field's own, finer grid (the two-scale relation): a finer level starts with
-    the same function. L-BFGS starts from P Pᵀ there, P the H¹ coordinates of
-    :class:`nsm.tasks.sobolev.Sobolev`. The line search goes back until the loss has decreased as
-    Armijo asks and the least det J_h at the samples, if it is known, is positive or has grown.
+    A step begins with the matrix K of the loss's curvature (:class:`nsm.tasks.curvature.Curvature`)
+    at the present coefficients, each component of a spline apart, with a little H¹ added; its
+    sparse factors are the metric in which L-BFGS begins. K is near enough to the Hessian that few
+    iterations follow, and they correct what it leaves out. Backtracking along each direction
+    ensures descent.
+
+    A level of n × n cells is a subspace of the finest grid by the two-scale relation of B-splines,
+    so a finer level begins with the same function.
+
+    The loss is minimized plus ``smoothing`` times the mean squared change of the splines' first
+    derivatives over a cell: points, which are fixed in a step, say nothing about what lies between
+    them.
 
     Args:
-        params: the coefficients of the fields, and nothing else.
+        params: the coefficients of all ``fields``.
         fields: the splines.
-        levels: cells along each axis of each level; each field's own number of cells is a level's
-            times a power of two.
+        levels: cells along each axis of each level, from coarse to fine; the finest are those of
+            the fields, the others these divided by powers of two.
         steps: of each level but the last, which lasts until the end. Fields that are not zero, as
             in a further training, have the last level alone.
         iterations: of L-BFGS in a step.
         memory: pairs of steps and changes of the gradient that are kept.
-        first_step: largest change of a coefficient in the first iteration of a level, in Ω's half
-            side.
+        smoothing: weight of the smoothness.
         lr: the length that the line search tries first, in quasi-Newton steps.
 
     Raises:
@@ -53,31 +70,33 @@ class QuasiNewton(Optimizer):
         steps: Sequence[int],
         iterations: int = 20,
         memory: int = 12,
-        first_step: float = 0.02,
+        smoothing: float = 0.1,
         lr: float = 1.0,
     ) -> None:
         if len(steps) != len(levels) - 1 or min(steps, default=0) < 0:
             raise ValueError("optimizer.steps has one number, 0 or more, per level but the last")
-        if min(iterations, memory) < 1 or not (first_step > 0 and lr > 0):
-            raise ValueError("optimizer.iterations, memory, first_step and lr must be above 0")
+        if min(iterations, memory) < 1 or not (smoothing >= 0 and lr > 0):
+            raise ValueError(
+                "optimizer.iterations, memory and lr must be above 0, smoothing not below"
+            )
         super().__init__(params, {"lr": lr})
         held = [p for group in self.param_groups for p in group["params"]]
         if {id(p) for p in held} != {id(f.coefficients) for f in fields}:
             raise ValueError("optimizer=quasi_newton trains splines alone; take map=spline with it")
         self.fields, self.levels, self.counts = list(fields), list(levels), list(steps)
-        for field in fields:
-            for cells in levels:
-                Level(field, cells)  # ValueError for one that does not fit
-        self.iterations, self.memory, self.first_step = iterations, memory, first_step
-        self.least: Callable[[], Tensor | None] = lambda: None
+        for cells in levels:
+            for field in fields:
+                if cells < 3 or field.cells % cells or (field.cells // cells).bit_count() != 1:
+                    Level(field, cells)  # says what is wrong
+        self.iterations, self.memory, self.smoothing = iterations, memory, smoothing
+        self.curvatures: Callable[[], Sequence[Curvature]] = lambda: []
         fresh = not any(f.coefficients.detach().count_nonzero() for f in fields)
-        state = self.state[self.fields[0].coefficients]
-        state["step"], state["s"], state["y"] = 0 if fresh else sum(steps), [], []
+        self.state[self.fields[0].coefficients]["step"] = 0 if fresh else sum(steps)
         self._level: tuple[int, list[Level]] | None = None
 
-    def watch(self, least: Callable[[], Tensor | None]) -> None:
-        """Take the function that gives the least det J_h of the last evaluation."""
-        self.least = least
+    def watch(self, curvatures: Callable[[], Sequence[Curvature]]) -> None:
+        """Take the function that gives the curvature of the loss as it was last evaluated."""
+        self.curvatures = curvatures
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
@@ -91,109 +110,140 @@ class QuasiNewton(Optimizer):
         """
         assert closure is not None, "L-BFGS evaluates the loss more than once in a step"
         state = self.state[self.fields[0].coefficients]
-        number = sum(state["step"] >= end for end in _ends(self.counts))
+        number = sum(state["step"] >= end for end in accumulate(self.counts))
         if self._level is None or self._level[0] != number:
             self._level = number, [Level(f, self.levels[number]) for f in self.fields]
-        if state["step"] in _ends(self.counts):
-            state["s"], state["y"] = [], []  # of the level before
         state["step"] += 1
-        found = self._evaluated(closure)
+        at = np.concatenate(
+            [
+                level.restored(_array(f.coefficients)).ravel()
+                for level, f in zip(self._level[1], self.fields, strict=True)
+            ]
+        )
+        found = self._evaluated(closure, at)
+        if found is None:  # rolled back from a loss that is not finite
+            return None
+        known = self.curvatures()
+        search = _Search(self.memory, self._metric(known), bool(known))
         for _ in range(self.iterations):
-            if found is None:  # rolled back from a loss that is not finite
+            moved = self._searched(closure, search, at, found)
+            if moved is None:
                 return None
-            moved = self._searched(closure, state, found)
-            if moved is found:  # no step along that direction serves
-                if not state["s"]:
-                    break
-                state["s"], state["y"] = [], []
-            found = moved
-        return None if found is None else found[0]
+            at, found, stuck = moved
+            if stuck and not search.forget():
+                break
+        return found.loss
 
-    def _evaluated(self, closure: Callable[[], Any]) -> _Found | None:
-        """Loss, gradient on the level, and least det J_h; None if the step was rolled back."""
+    def _evaluated(self, closure: Callable[[], Any], at: np.ndarray) -> _Found | None:
+        """Loss and gradient at coefficients of the level; None if the step was rolled back."""
         assert self._level is not None
+        self._put(at)
         with torch.enable_grad():
             loss = closure()
-        least = self.least()
-        gradients = [f.coefficients.grad for f in self.fields]
-        if loss is None or any(g is None for g in gradients):
+        gradients = [f.coefficients.grad for f in self.fields if f.coefficients.grad is not None]
+        if loss is None or len(gradients) < len(self.fields):
             return None
-        parts = [
-            level.restricted(g).flatten()
-            for level, g in zip(self._level[1], gradients, strict=True)
-            if g is not None
-        ]
-        return loss, torch.cat(parts), 1.0 if least is None else float(least)
+        value, parts = float(loss), []
+        each = zip(self._level[1], gradients, self._split(at), strict=True)
+        for level, g, c in each:
+            rough = level.smoothness @ c
+            value += self.smoothing * float((c * rough).sum())
+            parts.append(level.up.T @ _array(g) + 2 * self.smoothing * rough)
+        return _Found(loss, value, np.concatenate([part.ravel() for part in parts]))
 
     def _searched(
-        self, closure: Callable[[], Any], state: dict[str, Any], at: _Found
-    ) -> _Found | None:
-        """One iteration: what is found after it; ``at`` itself if no step serves."""
-        loss, g, det = at
-        value, d = float(loss), self._direction(state, g)
-        slope, length = float(g @ d), self.param_groups[0]["lr"]
-        if not slope < 0:
-            return at
-        if not state["s"]:
-            length = min(length, self.first_step / max(float(d.abs().max()), 1e-30))
-        start = [f.coefficients.detach().clone() for f in self.fields]
-        for _ in range(_TRIALS):
-            self._move(start, length * d)
-            found = self._evaluated(closure)
-            if found is None:
+        self, closure: Callable[[], Any], search: _Search, at: np.ndarray, found: _Found
+    ) -> tuple[np.ndarray, _Found, bool] | None:
+        """One iteration: the coefficients and what is found there, and whether no step serves."""
+        d = -search.direction(found.gradient)
+        slope, length = float(found.gradient @ d), search.first(d, self.param_groups[0]["lr"])
+        for _ in range(_TRIALS if slope < 0 else 0):
+            new = self._evaluated(closure, at + length * d)
+            if new is None:
                 return None
-            new = float(found[0])
-            if new <= value + _SUFFICIENT * length * slope and found[2] >= min(det, 0.0):
-                self._learn(state, length * d, found[1] - g)
-                return found
-            excess = new - value - length * slope  # of the parabola through both ends
+            if new.value <= found.value + _SUFFICIENT * length * slope:
+                search.learn(length * d, new.gradient - found.gradient)
+                return at + length * d, new, False
+            excess = new.value - found.value - length * slope  # of the parabola through both ends
             least = -slope * length**2 / (2 * excess) if excess > 0 else 0.5 * length
             length = min(max(least, 0.1 * length), 0.5 * length)
-        for field, c in zip(self.fields, start, strict=True):
-            field.coefficients.copy_(c)
-        return at
+        self._put(at)
+        return at, found, True
 
-    def _split(self, flat: Tensor) -> list[Tensor]:
-        """A vector of all fields' coefficients on the level, by field, each (side², d)."""
+    def _metric(self, known: Sequence[Curvature]) -> Callable[[np.ndarray], np.ndarray]:
+        """The inverse of K on the level, at the present coefficients."""
         assert self._level is not None
-        widths = [f.out_dim for f in self.fields]
-        each = zip(self._level[1], widths, strict=True)
-        sizes = [level.side**2 * width for level, width in each]
-        parts = zip(flat.split(sizes), widths, strict=True)
-        return [part.view(-1, width) for part, width in parts]
+        matrices = [
+            [level.floor + 2 * self.smoothing * level.smoothness] * level.out_dim
+            for level in self._level[1]
+        ]
+        place = {id(field): k for k, field in enumerate(self.fields)}
+        for curvature in known:
+            field, x, blocks = curvature.of_field()
+            k = place[id(field)]
+            more = self._level[1][k].matrices(x, blocks)
+            matrices[k] = [a + b for a, b in zip(matrices[k], more, strict=True)]
+        metrics = [Metric(each) for each in matrices]
 
-    def _move(self, start: list[Tensor], step: Tensor) -> None:
+        def solve(g: np.ndarray) -> np.ndarray:
+            parts = zip(metrics, self._split(g), strict=True)
+            return np.concatenate([metric.solve(part).ravel() for metric, part in parts])
+
+        return solve
+
+    def _split(self, flat: np.ndarray) -> list[np.ndarray]:
+        """A vector of all fields' coefficients on the level, by field, each (rows, d)."""
         assert self._level is not None
-        each = zip(self.fields, start, self._level[1], self._split(step), strict=True)
-        for field, c, level, part in each:
-            field.coefficients.copy_(c + level.prolonged(part))
+        ends = accumulate(level.rows * level.out_dim for level in self._level[1])
+        parts = np.split(flat, list(ends)[:-1])
+        return [p.reshape(-1, f.out_dim) for p, f in zip(parts, self.fields, strict=True)]
 
-    def _preconditioned(self, g: Tensor) -> Tensor:
+    def _put(self, at: np.ndarray) -> None:
         assert self._level is not None
-        each = zip(self._level[1], self._split(g), strict=True)
-        return torch.cat([level.sobolev(level.sobolev(part)).flatten() for level, part in each])
+        for field, level, c in zip(self.fields, self._level[1], self._split(at), strict=True):
+            field.coefficients.copy_(torch.from_numpy(level.up @ c))
 
-    def _direction(self, state: dict[str, Any], g: Tensor) -> Tensor:
-        """The two-loop recursion (Nocedal and Wright, Algorithm 7.4), from P Pᵀ."""
-        q, shares = g.clone(), []
-        pairs = list(zip(state["s"], state["y"], strict=True))
+
+class _Search:
+    """The two-loop recursion (Nocedal and Wright, Algorithm 7.4) from the inverse of a metric."""
+
+    def __init__(self, memory: int, solve: Callable[[np.ndarray], np.ndarray], known: bool) -> None:
+        self.memory, self.solve, self.known = memory, solve, known
+        self.s: list[np.ndarray] = []
+        self.y: list[np.ndarray] = []
+        self.scale = 1.0
+
+    def direction(self, g: np.ndarray) -> np.ndarray:
+        """The inverse of the approximate Hessian times a gradient."""
+        q, shares = g.copy(), []
+        pairs = list(zip(self.s, self.y, strict=True))
         for s, y in reversed(pairs):
             shares.append((s @ q) / (s @ y))
             q -= shares[-1] * y
-        d = self._preconditioned(q)
-        if pairs:
-            s, y = pairs[-1]
-            d *= (s @ y) / (y @ self._preconditioned(y))
+        d = self.scale * self.solve(q)
         for s, y in pairs:
             d += (shares.pop() - (y @ d) / (s @ y)) * s
-        return -d
+        return d
 
-    def _learn(self, state: dict[str, Any], s: Tensor, y: Tensor) -> None:
-        if float(s @ y) > _FLAT * float(s.norm() * y.norm()):
-            state["s"] = [*state["s"], s][-self.memory :]
-            state["y"] = [*state["y"], y][-self.memory :]
+    def first(self, d: np.ndarray, lr: float) -> float:
+        """The first length to be tried along a direction."""
+        if self.known or self.s:
+            return lr
+        return min(lr, _FIRST / max(float(np.abs(d).max()), 1e-30))
+
+    def learn(self, s: np.ndarray, y: np.ndarray) -> None:
+        """Take a step and the change of the gradient."""
+        if s @ y > _FLAT * np.linalg.norm(s) * np.linalg.norm(y):
+            if not self.s:
+                self.scale = (s @ y) / (y @ self.solve(y))
+            self.s, self.y = [*self.s, s][-self.memory :], [*self.y, y][-self.memory :]
+
+    def forget(self) -> bool:
+        """Begin again from the metric; False if nothing was learned."""
+        learned = bool(self.s)
+        self.s, self.y = [], []
+        return learned
 
 
-def _ends(counts: Sequence[int]) -> list[int]:
-    """The step at which each level but the first begins."""
-    return list(accumulate(counts))
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy()

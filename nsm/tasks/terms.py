@@ -28,6 +28,8 @@ class Evaluation:
         source: (N, 2, 2) metric A of the source; None for overfit.
         target: (N, 2, 2) metric B of the image; None for a collection, whose targets are many.
         determinant: (N,) det J_h; None for overfit.
+        share: (N,) of the area, where the places are triangles: uv and the others are those of
+            their centres, metrics in the frames of their first two sides; None: samples.
     """
 
     uv: Tensor
@@ -36,6 +38,7 @@ class Evaluation:
     source: Tensor | None = None
     target: Tensor | None = None
     determinant: Tensor = None  # type: ignore[assignment]
+    share: Tensor | None = None
 
 
 class LossTerm(nn.Module):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from torch import Tensor
 
 from nsm.tasks.compiling import Compiled
+from nsm.tasks.curvature import Curvature
 from nsm.tasks.microbatching import Microbatching
 from nsm.tasks.optimizers import configure
 from nsm.tasks.quasi_newton import QuasiNewton
@@ -23,7 +24,7 @@ class Training(Microbatching):
         progress_figure, progress_form: the logged figure beside the progress bar, and its format.
         log_every: steps between two logged values; logging each step would take Lightning as long
             as the network takes for its work.
-        least_determinant: of J_h at the samples of the last evaluation; None: h has none.
+        batch: of the last evaluation of a training step.
         compiled: calls evaluations of a training step in compiled form; None: uncompiled.
     """
 
@@ -34,7 +35,7 @@ class Training(Microbatching):
     loss_terms: Any  # ModuleDict of nsm.tasks.terms.LossTerm
     log_every = 1
     compiled: Compiled | None = None
-    least_determinant: Tensor | None = None
+    batch: Any = None
 
     def pointwise(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
@@ -73,5 +74,10 @@ class Training(Microbatching):
     def configure_optimizers(self) -> Any:
         configured = configure(self.map, self.hparams)
         if isinstance(configured["optimizer"], QuasiNewton):
-            configured["optimizer"].watch(lambda: self.least_determinant)
+            configured["optimizer"].watch(self.curvatures)
         return configured
+
+    def curvatures(self) -> Sequence[Curvature]:
+        """The curvature of the loss of the last training step by each planar map, for quasi-Newton
+        steps; terms that say nothing of theirs are left out."""
+        return []

@@ -104,3 +104,50 @@ def test_a_stored_fast_map_is_loaded_again(surfaces, tmp_path):
     again = nsm.load(tmp_path / "run")
     uv = torch.as_tensor(f.source.surface.uv[:50], dtype=torch.float32)
     assert torch.equal(again.map(uv), f.map(uv))
+
+
+def small(task, *words):
+    return compose_config(
+        [f"task={task}", *(w for w in WORDS if not w.startswith("task=")), *words]
+    )
+
+
+def test_a_fast_flattening_lowers_the_energy(surfaces, tmp_path):
+    words = ["trainer.max_steps=3", "certification.rounds=0"]
+    f = run_task(small("param", *words), tmp_path / "run", Given(phi=surfaces[1]))
+    uv = torch.as_tensor(surfaces[1].surface.uv, dtype=torch.float32)
+    source = first_fundamental_form(surfaces[1].map.value_and_jacobian(uv)[1])
+    flat = first_fundamental_form(f.map.value_and_jacobian(uv)[1])
+    before = symmetric_dirichlet(source, torch.eye(2).expand_as(source)).mean()
+    after = symmetric_dirichlet(source, flat).mean()
+    assert f.certificate["certified"]
+    assert 3.98 < float(after) < float(before) - 0.01
+
+
+def values_of(figures, name):
+    """All values under a name in nested dictionaries."""
+    inner = [values_of(v, name) for v in figures.values() if isinstance(v, dict)]
+    return [v for values in inner for v in values] + [v for k, v in figures.items() if k == name]
+
+
+def test_a_fast_collection_meets_its_landmarks(surfaces, tmp_path):
+    marks = [list(each) for each in zip(*[(a, b, a) for a, b in MARKS], strict=True)]
+    given = Given(surfaces=[*surfaces, surfaces[0]], landmarks=marks)
+    f = run_task(small("collection_map", "trainer.max_steps=6"), tmp_path / "run", given)
+    assert f.certificate["certified"]
+    errors = values_of(f.metrics, "landmark_error_max_percent")
+    assert errors and max(errors) < 0.2
+
+
+@pytest.mark.parametrize("task", ["pair_map", "param", "collection_map"])
+def test_a_preview_is_the_fast_way_on_coarse_levels(task):
+    fast, preview = (
+        compose_config([f"task={task}", f"experiment={e}"]) for e in ("fast", "preview")
+    )
+    assert (
+        preview.constraints == fast.constraints
+        and preview.optimizer._target_ == fast.optimizer._target_
+    )
+    assert preview.trainer.max_steps < fast.trainer.max_steps
+    assert max(preview.data.points) < max(fast.data.points)
+    assert list(preview.data.steps) == list(preview.optimizer.steps)

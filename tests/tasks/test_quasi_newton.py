@@ -1,4 +1,4 @@
-"""Quasi-Newton steps: H¹ coordinates, levels that are subspaces, descent, and resumption."""
+"""Quasi-Newton steps: curvature, levels that are subspaces, descent, and resumption."""
 
 import copy
 
@@ -7,56 +7,148 @@ import pytest
 import torch
 
 from nsm.errors import NsmError
-from nsm.maps import DiscMap, NeuralMap, SplineField
+from nsm.maps import DiscMap, LatticeAligned, NeuralMap, PlanarMap, SplineField, TorusMap
+from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.optimizers import build_optimizer
 from nsm.tasks.quasi_newton import QuasiNewton
-from nsm.tasks.sobolev import Level, Sobolev
+from nsm.tasks.spline_level import Level, Metric
 
 SETTINGS = {
     "_target_": "nsm.tasks.quasi_newton.QuasiNewton",
     "levels": [4, 8],
     "steps": [2],
     "iterations": 5,
+    "smoothing": 0.0,
 }
 
 
-def path_or_cycle(count, periodic):
-    """Minus the second difference as a dense matrix."""
-    matrix = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
-    if periodic:
-        matrix[0, -1] = matrix[-1, 0] = -1
-    else:
-        matrix[0, 0] = matrix[-1, -1] = 1
-    return matrix
+KINDS = [(False, False), (True, False), (True, True)]  # periodic, odd
 
 
-@pytest.mark.parametrize("periodic", [False, True])
-def test_preconditioner_is_the_inverse_of_the_dense_inner_product(periodic):
-    cells = 6
-    side = cells if periodic else cells + 2
-    along = path_or_cycle(side, periodic) * (cells / 2) ** 2  # neighbours are 2 / cells apart
-    one = np.eye(side)
-    dense = np.eye(side**2) + np.kron(along, one) + np.kron(one, along)
-    c = torch.randn(side**2, 3, dtype=torch.float64)
-    p = Sobolev(side, cells, periodic, c)
-    expected = torch.as_tensor(np.linalg.solve(dense, c.numpy()))
-    torch.testing.assert_close(p(p(c)), expected)
-
-
-@pytest.mark.parametrize("periodic", [False, True])
-def test_a_level_is_the_same_spline_on_the_fine_grid(periodic):
-    torch.manual_seed(0)
-    coarse, fine = (SplineField(2, cells, periodic).double() for cells in (5, 20))
+def filled(cells, periodic, odd, out_dim=2):
+    """A double-precision spline with random coefficients."""
+    field = SplineField(out_dim, cells, periodic, odd).double()
     with torch.no_grad():
-        coarse.coefficients.normal_()
-    level = Level(fine, 5)
+        field.coefficients.normal_(generator=torch.Generator().manual_seed(cells))
+    return field
+
+
+def points(count=300):
+    return 2 * torch.rand(count, 2, generator=torch.Generator().manual_seed(1)).double() - 1
+
+
+@pytest.mark.parametrize("periodic, odd", KINDS)
+def test_a_level_is_the_same_spline_on_the_fine_grid(periodic, odd):
+    coarse, fine = filled(6, periodic, odd), filled(24, periodic, odd)
+    level = Level(fine, 6)
+    c = coarse.coefficients.detach().numpy()
     with torch.no_grad():
-        fine.coefficients.copy_(level.prolonged(coarse.coefficients))
-    x = 2 * torch.rand(300, 2, dtype=torch.float64) - 1
+        fine.coefficients.copy_(torch.from_numpy(level.up @ c))
+    x = points()
     torch.testing.assert_close(fine(x), coarse(x))
-    g = torch.randn_like(fine.coefficients)
-    down = (level.restricted(g) * coarse.coefficients).sum()
-    torch.testing.assert_close(down, (g * level.prolonged(coarse.coefficients)).sum())
+    np.testing.assert_allclose(level.restored(level.up @ c), c, atol=1e-9)
+
+
+@pytest.mark.parametrize("periodic, odd", KINDS)
+def test_smoothness_is_the_mean_squared_change_of_slopes_over_a_cell(periodic, odd):
+    cells = 24
+    field = SplineField(1, cells, periodic, odd).double()
+    # a spline near to sin(πu) + ½ sin(πv), whose second derivatives are known
+    side = torch.arange(field.side).double()
+    at = -1 + (side + (0.5 if periodic else -0.5)) * (2 / cells)
+    wave = (torch.pi * at).sin()
+    table = (wave[:, None] + 0.5 * wave).flatten()
+    c = table[: len(field.coefficients)].numpy()[:, None]
+    expected = (2 / cells) ** 2 * torch.pi**4 * 0.5 * (1 + 0.25)
+    found = float((c * (Level(field, cells).smoothness @ c)).sum())
+    assert found == pytest.approx(expected, rel=0.12)
+
+
+@pytest.mark.parametrize("periodic, odd", KINDS)
+def test_a_levels_matrices_are_quadratic_forms_of_what_points_see(periodic, odd):
+    field = filled(8, periodic, odd)
+    x = points(40)
+    half = torch.randn(2, 40, 3, 3, dtype=torch.float64)
+    blocks = half @ half.mT
+    found = Level(field, 8).matrices(x, blocks)
+    value, jacobian = field.value_and_jacobian(x)
+    seen = torch.cat([value[..., None], jacobian], dim=-1)  # (N, 2, 3)
+    c = field.coefficients.detach().numpy()
+    for k, matrix in enumerate(found):
+        expected = torch.einsum("np,npq,nq->", seen[:, k], blocks[k], seen[:, k]).detach()
+        assert c[:, k] @ (matrix @ c[:, k]) == pytest.approx(float(expected), rel=1e-9)
+        assert abs(matrix - matrix.T).max() < 1e-9
+
+
+def test_a_metric_solves_each_component():
+    level = Level(SplineField(1, 6), 6)
+    matrices = [level.floor, level.floor + level.smoothness]
+    right = np.random.default_rng(0).standard_normal((level.rows, 2))
+    solved = Metric(matrices).solve(right)
+    for k, matrix in enumerate(matrices):
+        np.testing.assert_allclose(matrix @ solved[:, k], right[:, k], atol=1e-8)
+
+
+def test_an_odd_spline_is_odd_and_periodic():
+    field, x = filled(8, True, True), points(50)
+    torch.testing.assert_close(field(-x), -field(x))
+    torch.testing.assert_close(field(x + torch.tensor([2.0, -4.0])), field(x))
+    for cells, periodic in ((7, True), (8, False)):
+        with pytest.raises(ValueError, match="odd"):
+            SplineField(2, cells, periodic, odd=True)
+
+
+def test_positive_hessians_are_those_of_a_convex_function():
+    form = torch.randn(4, 4, dtype=torch.float64)
+    form = form @ form.T
+    j = torch.randn(6, 2, 2, dtype=torch.float64)
+
+    def convex(at):
+        return 0.5 * torch.einsum("np,pq,nq->n", at.flatten(1), form, at.flatten(1))
+
+    torch.testing.assert_close(positive_hessians(convex, j), form.expand(6, 4, 4))
+    # the determinant has eigenvalues 1, 1, -1, -1: half of them are left
+    values = torch.linalg.eigvalsh(positive_hessians(torch.linalg.det, j))
+    torch.testing.assert_close(values, torch.tensor([0.0, 0, 1, 1]).double().expand(6, 4))
+
+
+@pytest.mark.parametrize("kind", ["plane", "disc", "lattice"])
+@pytest.mark.parametrize("entries", [2, 4])
+def test_curvature_is_the_second_difference_along_the_spline(kind, entries):
+    made = {
+        "plane": lambda: PlanarMap(SplineField(2, 8)),
+        "disc": lambda: DiscMap(SplineField(3, 8)),
+        "lattice": lambda: LatticeAligned(
+            TorusMap(SplineField(2, 8, True, True)),
+            torch.tensor([[1.0, 2.0], [0.0, 1.0]]),
+            torch.tensor([1.0, 0.0]),
+        ),
+    }
+    h = made[kind]().double()
+    [c] = h.parameters()
+    x = 0.6 * points(30)
+    with torch.no_grad():
+        c.copy_(0.1 * torch.randn(c.shape, dtype=torch.float64))
+    half = torch.randn(30, entries, entries, dtype=torch.float64)
+    hessians = half @ half.mT
+    field, at, blocks = Curvature(h, x, hessians).of_field()
+    matrices = Level(field, 8).matrices(at, blocks)
+
+    def seen(shift):
+        with torch.no_grad():
+            before = c.clone()
+            c.add_(shift)
+            value, jacobian = h.value_and_jacobian(x)
+            c.copy_(before)
+        return value if entries == 2 else jacobian.flatten(1)
+
+    for k, matrix in enumerate(matrices):
+        d = torch.zeros_like(c)
+        d[:, k] = torch.randn(len(c), dtype=torch.float64)
+        change = (seen(1e-5 * d) - seen(-1e-5 * d)) / 2e-5
+        expected = torch.einsum("np,npq,nq->", change, hessians, change)
+        found = d[:, k].numpy() @ (matrix @ d[:, k].numpy())
+        assert found == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_a_level_must_fit_the_field():
@@ -110,7 +202,7 @@ def test_a_coarse_level_stays_in_its_subspace():
     optimizer.step(made(optimizer))
     c = h.network.coefficients.detach()
     level = Level(h.network, 4)
-    basis = torch.stack([level.prolonged(e[:, None])[:, 0] for e in torch.eye(36)], dim=1)
+    basis = torch.as_tensor(level.up.toarray(), dtype=torch.float32)
     fitted = basis @ torch.linalg.lstsq(basis, c).solution
     torch.testing.assert_close(fitted, c, atol=1e-5, rtol=0)
     assert float(c.abs().max()) > 1e-2
@@ -134,26 +226,24 @@ def test_stored_and_loaded_it_goes_on_bit_for_bit(steps):
     assert torch.equal(again.network.coefficients, h.network.coefficients)
 
 
-def test_a_line_search_does_not_deepen_a_fold():
-    f = SplineField(2, 8)
-    optimizer = QuasiNewton([f.coefficients], [f], levels=[8], steps=[], iterations=3)
-    seen = []
-
-    def least():
-        seen.append(0.01 - float(f.coefficients.detach().abs().max()))  # folds if it moves far
-        return torch.tensor(seen[-1])
-
-    optimizer.watch(least)
+def test_known_curvature_reaches_a_quadratic_minimum_at_once():
+    h = PlanarMap(SplineField(2, 8))
+    optimizer = QuasiNewton(
+        [h.network.coefficients], [h.network], levels=[8], steps=[], iterations=3, smoothing=0.0
+    )
+    x = points(400).float()
+    wanted = x + 0.1 * torch.sin(3 * x.flip(1))
+    identity = torch.eye(2).expand(400, 2, 2) * (2 / 400)
+    optimizer.watch(lambda: [Curvature(h, x, identity)])
 
     def closure():
         optimizer.zero_grad()
-        loss = ((f.coefficients - 1) ** 2).sum()
+        loss = ((h(x) - wanted) ** 2).sum(dim=1).mean()
         loss.backward()
         return loss.detach()
 
-    optimizer.step(closure)
-    assert min(seen) < 0  # it was tried
-    assert 0 < float(f.coefficients.detach().abs().max()) <= 0.01
+    first = float(closure())
+    assert float(optimizer.step(closure)) < 1e-3 * first
 
 
 def test_a_step_that_was_rolled_back_ends():

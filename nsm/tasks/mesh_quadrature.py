@@ -1,0 +1,106 @@
+"""The triangles of a mesh as the places where a map's distortion is measured."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nsm.energies import first_fundamental_form
+
+_AT_ONCE = 8192
+_ALL = 65_536
+_THIN = 1e-4  # height of a triangle in Ω
+
+
+class Triangles(NamedTuple):
+    """Some of a mesh's triangles.
+
+    Attributes:
+        uv: (V, 2) their corners in Ω.
+        faces: (F, 3) in ``uv``.
+        points: (V, 3) of the surface at the corners.
+        metric: (F, 2, 2) of the surface in the frame of each triangle's first two sides.
+        share: (F,) of the area that each stands for; they add up to one.
+        determinant: (F,) twice the signed area in Ω.
+        oriented: (F,) ``share``, or zero where a triangle is so thin in Ω that single precision
+            does not tell whether its image has turned over.
+    """
+
+    uv: Tensor
+    faces: Tensor
+    points: Tensor
+    metric: Tensor
+    share: Tensor
+    determinant: Tensor
+    oriented: Tensor
+
+    def sides(self, image: Tensor) -> Tensor:
+        """The first two sides (F, n, 2) of the triangles with images (V, n) of the corners."""
+        a, b, c = image[self.faces].unbind(dim=1)
+        return torch.stack([b - a, c - a], dim=-1)
+
+    @property
+    def centres(self) -> Tensor:
+        """(F, 2) in Ω."""
+        return self.uv[self.faces].mean(dim=1)
+
+
+class MeshQuadrature(nn.Module):
+    """Triangles of a mesh, as many as are wanted, spread evenly by area.
+
+    A map that is linear on them has the distortion that figures are measured by, and nothing that
+    lies between a few samples is overlooked.
+
+    Args:
+        uv: (V, 2) vertices of the mesh in Ω.
+        faces: (F, 3), counter-clockwise.
+        surface: φ, (N, 2) to (N, 3).
+    """
+
+    uv: Tensor
+    faces: Tensor
+
+    def __init__(self, uv: Tensor, faces: Tensor, surface: nn.Module) -> None:
+        super().__init__()
+        self.register_buffer("uv", uv, persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        self._surface = [surface]  # not a part of this module
+        self._taken: tuple[int, Triangles] | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_taken": None}
+
+    @torch.no_grad()
+    def take(self, count: int) -> Triangles:
+        """All triangles; of a mesh with more than 65,536, those in the middle of ``count`` parts
+        of equal area, if these are fewer."""
+        if self._taken is not None and self._taken[0] == count:
+            return self._taken[1]
+        [surface] = self._surface
+        points = torch.cat([surface(part) for part in self.uv.split(_AT_ONCE)])
+        whole = _triangles(self.uv, self.faces, points)
+        if count < len(self.faces) > _ALL:
+            ends = whole.share.double().cumsum(0)
+            middles = (torch.arange(count, device=ends.device).double() + 0.5) / count * ends[-1]
+            found, times = torch.searchsorted(ends, middles).unique_consecutive(return_counts=True)
+            found = found.clamp(max=len(self.faces) - 1)
+            rows, faces = self.faces[found].unique(return_inverse=True)
+            part = _triangles(self.uv[rows], faces, points[rows])
+            share = times.to(part.share) / count
+            whole = part._replace(share=share, oriented=share * (part.oriented > 0))
+        self._taken = count, whole
+        return whole
+
+
+def _triangles(uv: Tensor, faces: Tensor, points: Tensor) -> Triangles:
+    some = Triangles(uv, faces, points, uv, uv, uv, uv)
+    metric = first_fundamental_form(some.sides(points))
+    area = torch.linalg.det(metric.double()).clamp(min=0).sqrt()
+    share = (area / area.sum()).to(metric.dtype)
+    sides = some.sides(uv)
+    determinant = torch.linalg.det(sides)
+    longest = torch.cat([sides, sides[..., :1] - sides[..., 1:]], dim=-1).norm(dim=1).amax(dim=1)
+    oriented = torch.where(determinant > _THIN * longest, share, 0.0)
+    return some._replace(metric=metric, share=share, determinant=determinant, oriented=oriented)
