@@ -32,7 +32,7 @@ from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.maps.analytic import ANALYTIC
 from nsm.pipeline import built, make_task, quiet_lightning
-from nsm.pipeline.resolve_inputs import landmark_vertices
+from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.results import NeuralSurface, analytic_surface, atomic_write, overfit_metrics
 from nsm.results.callbacks import GradientWatch
 from nsm.surfaces.cache import cache_folder

@@ -265,7 +265,8 @@ def test_a_map_is_compared_with_its_start(made):
     assert found == pytest.approx(np.median(distortions(s, image)), rel=1e-6)
     assert found > f.metrics["symmetric_dirichlet_median"]
     assert f.metrics["start_flipped_percent"] == 0  # a rotation of Ω
-    assert f.metrics["start_landmark_error_max_percent"] > 1
+    # the seams lead through all landmarks, which have the same places on both discs
+    assert f.metrics["start_landmark_error_max_percent"] == pytest.approx(0, abs=1e-3)
 
 
 def test_neural_surfaces_that_are_ready_are_mapped_as_they_are(made):
