@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +12,13 @@ from nsm.domains.orbifold.embedding import SIDE, Embedding, reduced_basis
 from nsm.domains.orbifold.repair import isotopy_class
 from nsm.surfaces.location import Places, locate
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 
 def nearest_lifts(
-    points: np.ndarray, near: np.ndarray, symmetric: bool, lattice: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+    points: Tensor, near: Tensor, symmetric: bool, lattice: np.ndarray | None = None
+) -> tuple[Tensor, Tensor]:
     """How points (N, 2) are moved to their lifts that are nearest to others (N, 2).
 
     Args:
@@ -25,18 +29,23 @@ def nearest_lifts(
     Returns:
         s (N, 1), which is ±1, and k (N, 2): the lifts are s x + k.
     """
+    import torch
+
     shape = np.eye(2) if lattice is None else lattice / SIDE
     basis = reduced_basis(shape)  # in another the nearest lift may be far from the rounded one
-    back = np.rint(np.linalg.inv(basis))
-    signs, shifts = np.ones((len(points), 1)), np.zeros((len(points), 2))
-    least = np.full(len(points), np.inf)
-    for sign in (1, -1) if symmetric else (1,):
-        first = np.rint((near - sign * points) @ back.T / SIDE)
-        for shift in product((-1, 0, 1), repeat=2):
-            by = SIDE * ((first + np.array(shift)) @ basis.T)
-            distance = np.linalg.norm((sign * points + by - near) @ shape.T, axis=1)
+    back = torch.from_numpy(np.rint(np.linalg.inv(basis)).T).to(points)
+    across, in_plane = (torch.from_numpy(m.T.copy()).to(points) for m in (basis, shape))
+    signs, shifts = torch.ones_like(points[:, :1]), torch.zeros_like(points)
+    least = torch.full_like(points[:, :1], torch.inf)
+    for sign in (1.0, -1.0) if symmetric else (1.0,):
+        first = ((near - sign * points) @ back / SIDE).round()
+        for shift in product((-1.0, 0.0, 1.0), repeat=2):
+            by = SIDE * ((first + first.new_tensor(shift)) @ across)
+            distance = ((sign * points + by - near) @ in_plane).norm(dim=1, keepdim=True)
             closer = distance < least
-            signs[closer], shifts[closer], least[closer] = sign, by[closer], distance[closer]
+            signs = torch.where(closer, sign, signs)
+            shifts = torch.where(closer, by, shifts)
+            least = torch.where(closer, distance, least)
     return signs, shifts
 
 
@@ -45,8 +54,11 @@ def lifted_near(
 ) -> np.ndarray:
     """Of all lifts of points (N, 2) those (N, 2) that are nearest to others (N, 2); arguments as
     for :func:`nearest_lifts`."""
-    sign, shift = nearest_lifts(points, near, symmetric, lattice)
-    return sign * points + shift
+    import torch
+
+    x, there = torch.as_tensor(points).double(), torch.as_tensor(near).double()
+    sign, shift = nearest_lifts(x, there, symmetric, lattice)
+    return (sign * x + shift).numpy()
 
 
 def triangles_over_domain(

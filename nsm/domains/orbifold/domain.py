@@ -148,12 +148,8 @@ class ClosedDomain(Domain):
     def lift(self, points: Tensor, near: Tensor, lattice: np.ndarray | None = None) -> Tensor:
         """The lifts of points (N, 2) nearest to others (N, 2), in the plane of a surface's lattice
         (2, 2); in coordinates of Ω if it is not given."""
-        import torch
-
-        x, there = (p.detach().cpu().double().numpy() for p in (points, near))
-        sign, shift = (
-            torch.as_tensor(part).to(points) for part in nearest_lifts(x, there, self.even, lattice)
-        )
+        here, there = points.detach(), near.detach().to(points)
+        sign, shift = nearest_lifts(here, there, self.even, lattice)
         return sign * points + shift
 
     def nearest_rotation(self, rotation: Tensor) -> Tensor:
