@@ -192,7 +192,8 @@ def section(results: dict[str, Any]) -> list[str]:
         f"CPU seconds of each stage on {results['machine']}, one thread, with an empty cache "
         "(`make bench-waiting MESHES=FOLDER`). Maps are from shrec07-384 to shrec07-388 with 21 "
         "landmarks; their neural surfaces are least-squares fits, made side by side, so that the "
-        "wait by the clock is shorter. Where there is no row for them, they are in the rest. The neural surface and the flattening are of shrec07-384.",
+        "wait by the clock is shorter. Where there is no row for them, they are in the rest. The "
+        "neural surface and the flattening are of shrec07-384.",
         "",
         "| stage | " + " | ".join(CASES[name] for name in cases) + " |",
         "|---" * (len(cases) + 1) + "|",
