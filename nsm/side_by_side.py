@@ -70,7 +70,9 @@ def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None)
             while waiting and not failures and len(running) < most:
                 number, call = waiting.popleft()
                 receiver, sender = context.Pipe(duplex=False)
-                process = context.Process(target=_answer, args=(call, sender), daemon=True)
+                process: BaseProcess = context.Process(
+                    target=_answer, args=(call, sender), daemon=True
+                )
                 running[receiver] = number, process  # known before an interrupt can come
                 _start(process)
                 sender.close()  # if the process dies, which has the other one, waiting ends
