@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-published bench-closed bench-correspondence bench-activation bench-speed bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-published bench-closed bench-correspondence bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -75,6 +75,13 @@ fuzz: .venv/.nsm-dev
 # on the GPU where there is one. MESHES adds the waiting times for bunny and animals.
 bench-speed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/speed.py $(if $(MESHES),--meshes $(MESHES))
+
+# CPU seconds of each stage from raw files to the last file written, and peers by the same figures:
+# ten minutes. PEER is the command of another mapper (see benchmarks/peers.py). MESHES as above.
+bench-waiting: .venv/.nsm-dev
+	$(BIN)/python benchmarks/waiting.py --meshes $(or $(MESHES),../shared/meshes)
+	$(BIN)/python benchmarks/peers.py --meshes $(or $(MESHES),../shared/meshes) \
+	  $(if $(PEER),--command '$(PEER)')
 
 # Time and memory of meshes of a million faces and of a collection of 20 surfaces: half an hour.
 bench-scale: .venv/.nsm-dev

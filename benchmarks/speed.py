@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 import published_step as published
 import scale
+import surface_training
 import torch
+import waiting
 from omegaconf import DictConfig
 from torch import Tensor, nn
 from training import module_of, samples_of
@@ -633,6 +635,10 @@ def page(results: dict[str, Any]) -> str:
             f"| {k} | {v['published_mib']:.0f} | {v['nsm_mib']:.0f} | {v['ratio']:.1f} |"
             for k, v in results["memory"].items()
         ]
+    if surface_training.RESULTS.exists():
+        lines += surface_training.section(json.loads(surface_training.RESULTS.read_text()))
+    if waiting.RESULTS.exists():
+        lines += waiting.section(json.loads(waiting.RESULTS.read_text()))
     if scale.RESULTS.exists():
         lines += scale.section(json.loads(scale.RESULTS.read_text()))
     return "\n".join(lines) + "\n"

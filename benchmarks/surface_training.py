@@ -94,6 +94,22 @@ def table(known: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def section(known: dict[str, Any]) -> list[str]:
+    """The results as a section of docs/performance.md."""
+    return [
+        "",
+        "## How much training the surfaces of a map need",
+        "",
+        "`python benchmarks/surface_training.py --meshes FOLDER`: the same map by "
+        "`experiment=fast` from surfaces after their least-squares fit and a number of steps. "
+        "Medians and 95th percentiles vary without a trend. Landmarks are met less closely from "
+        "surfaces that are hardly trained, still within 0.25 % of the diagonal. "
+        "Not measured: the default map, and other pairs.",
+        "",
+        *table(known).splitlines(),
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--meshes", type=Path, required=True)

@@ -312,3 +312,20 @@ def test_other_topology_is_refused_on_closed_domains(limbed):
         with pytest.raises(NsmError) as error:
             prepare_jointly(pair, [np.arange(5)] * 2, domain=domain, cache=False)
         assert error.value.kind == "wrong_topology"
+
+
+@pytest.mark.parametrize("domain", ["disc", "orbifold"])
+def test_meshes_laid_out_side_by_side_are_those_of_one_after_the_other(domain):
+    a, b = ball(2), ball(2)
+    meshes = [Mesh("ball", *a), Mesh("egg", b[0] * [1.0, 1.5, 0.8], b[1])]
+    ids = [nearest(a[0], POINTS)] * 2
+    both = [
+        prepare_jointly(
+            meshes, ids, domain=domain, cache=False, parameterization="slim", processes=n
+        )
+        for n in (1, 2)
+    ]
+    for one, other in zip(*both, strict=True):
+        assert (other.name, other.domain, other.log) == (one.name, one.domain, one.log)
+        for name, array in one.arrays().items():
+            np.testing.assert_array_equal(other.arrays()[name], array)

@@ -8,8 +8,11 @@ from rich.console import Console
 from tiny import dome
 
 from nsm.config import compose_config
+from nsm.domains import Disc
+from nsm.errors import NsmError
 from nsm.pipeline import surface_cache
 from nsm.pipeline.surface_cache import cached_surfaces
+from nsm.pipeline.training import plain
 
 SMALL = ["experiment=quick", "trainer.max_steps=2", "data.held_out=64", "data.batch_size=64"]
 SMALL += ["encoding.resolutions=[4]", "map.width=8"]
@@ -77,3 +80,54 @@ def test_what_depends_on_a_users_code_is_made_anew(surface, monkeypatch):
     assert not cached
     x = torch.rand(5, 2)
     assert not torch.equal(first.map(x), second.map(x))
+
+
+def steps_of(*words, overrides=()):
+    """Steps of the trainings of a map's neural surfaces, and where the cache has one of them."""
+    config = compose_config(["task=pair_map", *words])
+    config.phi.overrides = [*overrides]
+    overfit = surface_cache._overfit_config(config, Disc())
+    return overfit.trainer.max_steps, surface_cache._folder_of(dome(0.4, 4), plain(overfit)).name
+
+
+def test_maps_take_the_fit_alone_unless_told_otherwise():
+    alone, few, whole = (steps_of(*words) for words in ([], ["phi.steps=250"], ["phi.steps=null"]))
+    assert alone[0] == 0 and few[0] == 250
+    assert whole[0] == compose_config(["task=overfit"]).trainer.max_steps > 250
+    assert len({alone[1], few[1], whole[1]}) == 3  # apart in the cache
+    assert steps_of(overrides=["trainer.max_steps=70"])[0] == 70
+
+
+@pytest.mark.parametrize("choice", ["initialization=random", "encoding=fourier", "map=residual"])
+def test_without_a_fit_there_is_a_whole_training(choice):
+    whole = compose_config(["task=overfit", choice])
+    fitted = whole.map.get("linear_skip") == "fitted"
+    assert steps_of(overrides=[choice])[0] == (0 if fitted else whole.trainer.max_steps)
+
+
+def test_side_by_side_is_as_one_after_the_other(tmp_path, monkeypatch):
+    surfaces = [dome(0.4, 4), dome(0.7, 5)]
+    phis, told = [], []
+    for processes in (1, 2):
+        monkeypatch.setenv("NSM_CACHE", str(tmp_path / str(processes)))
+        words = ["task=pair_map", f"phi.processes={processes}", "trainer.accelerator=cpu"]
+        config = compose_config([*words, "trainer.progress=false"])
+        config.phi.overrides = ["encoding.resolutions=[4,8]", "trainer.max_steps=3", *SMALL[2:4]]
+        printed = io.StringIO()
+        phis.append(cached_surfaces(surfaces, config, Console(file=printed, width=200)))
+        told.append(printed.getvalue())
+    for one, other, surface in zip(*phis, surfaces, strict=True):
+        assert other.metrics == one.metrics and other.surface is surface
+        weights = one.map.state_dict()
+        assert all(torch.equal(weights[key], v) for key, v in other.map.state_dict().items())
+    for text in told:
+        assert [f"{s.name}: neural surface in" in text for s in surfaces] == [True, True]
+        assert "from the cache" not in text
+
+
+def test_bad_settings_are_told_from_another_process(surface):
+    config = compose_config(["task=pair_map", "phi.processes=2", "trainer.accelerator=cpu"])
+    config.phi.overrides = [*SMALL, "encoding.features=2"]  # too few for the fit
+    with pytest.raises(NsmError) as error:
+        cached_surfaces([surface, dome(0.7, 5)], config, Console(quiet=True))
+    assert error.value.kind == "not_instantiable"
