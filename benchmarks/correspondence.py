@@ -190,6 +190,12 @@ def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def rows_of(lines: list[dict[str, Any]]) -> list[str]:
+    """The rows in their order, after those that are kept from earlier versions."""
+    found = dict.fromkeys(line["row"] for line in lines)
+    return [*(row for row in found if row not in ROWS), *(row for row in ROWS if row in found)]
+
+
 def draw(lines: list[dict[str, Any]]) -> None:
     """Share of landmarks over error, one curve for each row, of the animals."""
     import matplotlib
@@ -198,7 +204,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6, 4))
-    for row in ROWS:
+    for row in rows_of(lines):
         chosen = [
             line["errors"] for line in lines if (line["row"], line["kind"]) == (row, "animals")
         ]
@@ -217,7 +223,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
 def write(lines: list[dict[str, Any]]) -> None:
     """The JSON of all lines, a summary for each kind and row, and the picture."""
     result: dict[str, Any] = {}
-    for row in ROWS:
+    for row in rows_of(lines):
         for kind in ("animals", *OTHERS):
             chosen = [line for line in lines if (line["row"], line["kind"]) == (row, kind)]
             if chosen:
