@@ -35,8 +35,17 @@ TASKS = {
     ("loss_weights", "pair"): "pair_map",
     ("constraints", "param"): "param",
     ("constraints", "pair"): "pair_map",
-    ("constraints", "fast_pair"): "pair_map",
+    ("constraints", "fast_pair_map"): "pair_map",
+    ("loss_weights", "fast_pair_map"): "pair_map",
+    ("data", "levels_pair_map"): "pair_map",
+    ("constraints", "fast_param"): "param",
+    ("loss_weights", "fast_param"): "param",
+    ("data", "levels_param"): "param",
+    ("constraints", "fast_collection_map"): "collection_map",
+    ("loss_weights", "fast_collection_map"): "collection_map",
+    ("data", "levels_collection_map"): "collection_map",
     ("experiment", "fast"): "pair_map",
+    ("experiment", "preview"): "pair_map",
     ("published", "param"): "param",
     ("published", "pair_map"): "pair_map",
     ("published", "collection_map"): "collection_map",
@@ -79,6 +88,8 @@ def mine(monkeypatch):
 def test_every_option_composes_and_is_made(group, name):
     task = TASKS.get((group, name), "param" if group == "energy" else "overfit")
     overrides = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
+    if group == "constraints" and name.startswith("fast_"):  # weights are chosen beside them
+        overrides.append(f"loss_weights={name}")
     config = compose_config(overrides)  # which makes network, optimizer, scheduler and more
     if group in ("energy", "domain", "sampler"):
         assert made(config[group]) is not None
@@ -145,12 +156,16 @@ def test_it_composes_within_the_callers_hydra_main(tmp_path, monkeypatch):
 
 
 def test_groups_can_be_changed_separately():
-    config = compose_config(["task=pair_map", "data=levels", "sampler=pool", "domain=square"])
+    config = compose_config(
+        ["task=pair_map", "data=levels_pair_map", "sampler=pool", "domain=square"]
+    )
     assert (config.data.points[0], config.sampler.pool) == (2048, 500_000)
     assert config.domain._target_ == "nsm.domains.Square"
-    config = compose_config(["task=pair_map", "constraints=fast_pair"])
+    config = compose_config(["task=pair_map", "constraints=fast_pair_map", "loss_weights=pair"])
     assert (config.constraints.multiplier_every, config.loss_weights.seam) == (1, 1e3)
-    config = compose_config(["task=pair_map", "experiment=paper", "constraints=fast_pair"])
+    config = compose_config(
+        ["task=pair_map", "experiment=paper", "constraints=fast_pair_map", "loss_weights=pair"]
+    )
     assert (config.constraints.multiplier_every, config.map.width) == (1, 128)
 
 
