@@ -27,7 +27,6 @@ class CoarseShape:
         vertices: (V, 3), about the mean of the surface.
         faces: (F, 3).
         ids: (V,) the vertices of the given mesh that are left.
-        normals: (V, 3) of length one.
         distance: (V, V) geodesic, along edges.
         mean_distance: (V,) to all points of the surface.
         tips: (K,) vertices far from everything, the most prominent first; given ones before them.
@@ -38,7 +37,6 @@ class CoarseShape:
     vertices: np.ndarray
     faces: np.ndarray
     ids: np.ndarray
-    normals: np.ndarray
     distance: np.ndarray
     mean_distance: np.ndarray
     tips: np.ndarray
@@ -108,7 +106,6 @@ def coarse_shape(
         points,
         coarse,
         ids,
-        _normals(points, coarse),
         distance,
         distance @ corner,
         tips,
@@ -122,15 +119,6 @@ def edge_distances(
 ) -> np.ndarray:
     """Lengths (S, V) of shortest paths along edges, from sources (S,) or from all vertices."""
     return np.asarray(dijkstra(edge_graph(vertices, faces), directed=False, indices=sources))
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3), means of those of the triangles around weighted by area."""
-    normals = np.zeros_like(vertices)
-    corner = vertices[faces]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    np.add.at(normals, faces.ravel(), np.repeat(cross, 3, axis=0))
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
 def _spread(distance: np.ndarray, chosen: list[int], count: int) -> np.ndarray:

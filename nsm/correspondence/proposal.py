@@ -13,11 +13,10 @@ from nsm.correspondence.search import (
     changes,
     missed,
     rigid_residual,
-    turned,
 )
 
 # weights beside the logarithm of the energy
-_DISTANCES, _RIGID, _TURNED, _MISSED = 4.0, 2.0, 1.0, 4.0
+_DISTANCES, _RIGID, _MISSED = 4.0, 2.0, 4.0
 _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which they are two
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
@@ -35,12 +34,10 @@ class Hypothesis:
         vertices: (L, 2) corresponding vertices of source and target: landmarks that were given;
             the four at the cones of the orbifold; then other tips that the map brings near to each
             other.
-        score: log energy + 4 distance_change + 2 rigid_residual + turned + 4 missed; lower is
-            better.
+        score: log energy + 4 distance_change + 2 rigid_residual + 4 missed; lower is better.
         energy: mean symmetric Dirichlet energy of the coarse map; 4 at isometry.
         distance_change: mean change of geodesic distances, over √area.
         rigid_residual: root mean square distance after the best rigid motion, over √area.
-        turned: mean 1 - cos of the angle between normals after that motion.
         missed: mean distance, over √area, by which the coarse map misses given landmarks.
         candidate: the coarse map.
     """
@@ -50,7 +47,6 @@ class Hypothesis:
     energy: float
     distance_change: float
     rigid_residual: float
-    turned: float
     missed: float
     candidate: Candidate
 
@@ -120,13 +116,12 @@ def _hypothesis(candidate: Candidate) -> Hypothesis:
     change = float(changes(s, s.samples, t, images))
     residual = rigid_residual(s, s.samples, t, images)
     off = float(missed(candidate).mean()) if candidate.source.shape.given else 0.0
-    turn = turned(candidate)
     score = float(np.log(candidate.energy)) + _DISTANCES * change + _RIGID * residual
-    score += _TURNED * turn + _MISSED * off
+    score += _MISSED * off
     pairs = _matched_tips(candidate)
     ids = candidate.source.shape.ids[pairs[:, 0]], candidate.target.shape.ids[pairs[:, 1]]
     return Hypothesis(
-        np.stack(ids, axis=1), score, candidate.energy, change, residual, turn, off, candidate
+        np.stack(ids, axis=1), score, candidate.energy, change, residual, off, candidate
     )
 
 

@@ -66,20 +66,6 @@ class Anchors(NamedTuple):
     weight: float
 
 
-class Directions(NamedTuple):
-    """Unit normals that maps of a batch should take to one another.
-
-    Attributes:
-        source: (H, N, 3) at each triangle of the source, turned into the pose of each target.
-        tables: (T, C, C, 3) of the targets, over their grids.
-        weight: of 1 - cos of the angle between them, beside the energy.
-    """
-
-    source: np.ndarray
-    tables: np.ndarray
-    weight: float
-
-
 class Batch:
     """Maps h of one source's layout to targets, x ↦ B (x + n(x)) + c, and their energies.
 
@@ -91,7 +77,6 @@ class Batch:
         shifts: c (H, 2).
         largest: of the waves.
         anchors: points that the maps draw together.
-        directions: normals that they take to one another.
     """
 
     def __init__(
@@ -103,7 +88,6 @@ class Batch:
         shifts: np.ndarray,
         largest: int,
         anchors: Anchors | None = None,
-        directions: Directions | None = None,
     ) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=torch.float32)
@@ -120,26 +104,13 @@ class Batch:
             self.anchor_basis = tensor(Sines.up_to(largest).basis(anchors.points)[0])
             self.anchors, self.places = tensor(anchors.points), tensor(anchors.places)
             self.shapes = tensor(anchors.shapes)
-        self.directed = 0.0 if directions is None else directions.weight
-        if directions is not None:
-            self.normals, self.normal_tables = tensor(directions.source), tensor(directions.tables)
 
     def losses(self, amplitudes: Tensor) -> Tensor:
-        """The energies (H,), and what anchors and directions add to them."""
+        """The energies (H,), and what anchors add to them."""
         loss = self.energies(amplitudes)
         if self.weight:
             loss = loss + self.weight * self.gaps(amplitudes)
-        if self.directed:
-            loss = loss + self.directed * self.turns(amplitudes)
         return loss
-
-    def turns(self, amplitudes: Tensor) -> Tensor:
-        """Mean 1 - cos (H,) of the angles between normals and those at the images."""
-        basis = self.basis[0][:, : amplitudes.shape[1]]
-        h = self.at + torch.einsum("nk,hkc->hnc", basis, amplitudes)
-        image = torch.einsum("hij,hnj->hni", self.matrices, h) + self.shifts[:, None]
-        off = self._interpolated(self.normal_tables, image) - self.normals
-        return 0.5 * (off**2).sum(dim=-1) @ self.area
 
     def gaps(self, amplitudes: Tensor) -> Tensor:
         """Sum (H,) of the squared distances of anchors' images to the nearest lifts of places."""

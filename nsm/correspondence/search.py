@@ -17,32 +17,26 @@ import torch
 
 from nsm.correspondence.coarse_shape import CoarseShape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
-from nsm.correspondence.refinement import Anchors, Batch, Directions, Sines, refined
+from nsm.correspondence.refinement import Anchors, Batch, Sines, refined
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
 from nsm.errors import NsmError
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
-_DIRECTED = 40.0  # weight of 1 - cos of the angle between normals, beside the energy
 _HOLD = 50.0  # weight of the squared distance, over the area, by which a map misses a landmark
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of trainings: how many maps, their largest wave, steps, and whether normals count.
-
-    Normals count in the pose that a map gives, so only once it is near its end.
-    """
+    """One round of trainings: how many maps, their largest wave, and steps."""
 
     maps: int
     largest: int
     steps: int
-    directed: bool = False
 
 
-_LAST = Round(16, 8, 20, directed=True)
-ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40), _LAST, _LAST)
+ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40))
 
 
 @dataclass(frozen=True)
@@ -148,15 +142,6 @@ def pose(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.asarray(left @ flip @ right)
 
 
-def turned(candidate: Candidate) -> float:
-    """Mean 1 - cos of the angles between normals at samples, moved rigidly, and at their images."""
-    s, t = candidate.source.shape, candidate.target.shape
-    images = candidate.images(s.samples)
-    turn = pose(s.vertices[s.samples], t.vertices[images])
-    cosine = ((s.normals[s.samples] @ turn) * t.normals[images]).sum(axis=1)
-    return float(1 - cosine.mean())
-
-
 def _laid_out(shape: CoarseShape, sets: np.ndarray) -> list[Layout]:
     every = [layout(shape, four) for four in sets]
     return [one for one in every if one is not None]
@@ -240,7 +225,6 @@ def trained(
             np.stack([c.shift for c in group_]),
             one.largest,
             _anchors(group_[0].source, group_, held),
-            _directions(group_[0].source, group_, tables) if one.directed else None,
         )
         start = torch.zeros(len(group_), waves, 2)
         for k, candidate in enumerate(group_):  # few waves come first among many
@@ -267,16 +251,3 @@ def _anchors(source: Layout, found: Sequence[Candidate], held: np.ndarray | None
     shapes = [t.lattice / SIDE / np.sqrt(t.area) for t in targets]
     places = [t.uv[held[:, 1]] for t in targets]
     return Anchors(source.embedding.uv[held[:, 0]], np.stack(places), np.stack(shapes), _HOLD)
-
-
-def _directions(source: Layout, found: Sequence[Candidate], tables: Sequence[Table]) -> Directions:
-    """The source's normals in the pose that each candidate gives, and the targets' normals."""
-    shape, target = source.shape, found[0].target.shape
-    normals = shape.normals[shape.faces].mean(axis=1)
-    points = shape.vertices[shape.samples]
-    turned_ = [
-        normals @ pose(points, target.vertices[candidate.images(shape.samples)])
-        for candidate in found
-    ]
-    grids = np.stack([target.normals[one.vertex] for one in tables])
-    return Directions(np.stack(turned_), grids, _DIRECTED)

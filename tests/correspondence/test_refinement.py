@@ -14,7 +14,6 @@ from nsm.correspondence.layouts import _logarithm
 from nsm.correspondence.refinement import (
     Anchors,
     Batch,
-    Directions,
     Sines,
     _exponential,
     refined,
@@ -156,16 +155,3 @@ def test_anchors_are_drawn_to_the_nearest_of_all_lifts():
     assert added == pytest.approx(7 * expected, rel=1e-3)
     drawn, _ = refined(batch, torch.zeros(1, 12, 2), 100)
     assert batch.gaps(drawn).item() < 0.5 * batch.gaps(torch.zeros(1, 12, 2)).item()
-
-
-@given(st.floats(0, np.pi))
-@examples(10)
-def test_normals_count_by_the_angle_between_them(angle):
-    ours = np.tile([0.0, 0.0, 1.0], (1, len(POINTS), 1))
-    theirs = np.tile([np.sin(angle), 0.0, np.cos(angle)], (1, 8, 8, 1))
-    directions = Directions(ours, theirs, 3.0)
-    batch = flat([constant(np.eye(2))], [np.eye(2)], [(0, 0)], directions=directions)
-    nothing = torch.zeros(1, 12, 2)
-    assert batch.turns(nothing).item() == pytest.approx(1 - np.cos(angle), abs=1e-5)
-    added = (batch.losses(nothing) - batch.energies(nothing)).item()
-    assert added == pytest.approx(3 * (1 - np.cos(angle)), abs=1e-4)
