@@ -45,7 +45,8 @@ bench-published: .venv/.nsm-dev
 bench-closed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/closed_surfaces.py $(if $(MESHES),--meshes $(MESHES))
 
-# Correspondences without landmarks, errors at annotated ones: an hour, or EVERY=5. MESHES as above.
+# Correspondences with no landmarks or few, errors at annotated ones, beside peers (nsm[peers]): an
+# hour and a half, or EVERY=6. It goes on where it stopped. MESHES as above.
 bench-correspondence: .venv/.nsm-dev
 	$(BIN)/python benchmarks/correspondence.py $(if $(MESHES),--meshes $(MESHES)) \
 	  $(if $(EVERY),--every $(EVERY))

@@ -29,16 +29,13 @@ def zoomout_map(
     """Points (K, 3) of the target for vertices (K,) of the source: wave kernel signatures, terms of
     commutation and orientation, then ZoomOut."""
     from pyFM.functional import FunctionalMapping
-    from pyFM.refine.zoomout import mesh_zoomout_refine
 
     (ours, s), (theirs, t) = _both(source, source_faces, target, target_faces, vertices)
-    for mesh in (s, t):
-        mesh.process(k=_LAST + 1)
     model = FunctionalMapping(t, s)  # its point-wise map goes from the second to the first
     model.preprocess(n_descr=100, descr_type="WKS", subsample_step=5, k_process=_LAST + 1)
     model.fit(K=(_FIRST, _FIRST), w_descr=1.0, w_lap=1e-2, w_dcomm=1e-1, w_orient=1e-1)
-    count = (_LAST - _FIRST) // _STEP
-    _, nearest = mesh_zoomout_refine(model.FM, t, s, nit=count, step=_STEP, return_p2p=True)
+    model.zoomout_refine(nit=(_LAST - _FIRST) // _STEP, step=_STEP)
+    nearest = model.get_p2p()
     return np.asarray(t.vertices)[nearest[np.searchsorted(ours, vertices)]] * theirs[1] + theirs[0]
 
 

@@ -1,6 +1,7 @@
 """experiment=paper has the settings of the paper, and says of each where it comes from."""
 
 import re
+from functools import cache
 
 import pytest
 import torch
@@ -112,9 +113,14 @@ CHAINS = {
 }
 
 
+@cache
+def paper(task):
+    return compose_config([f"task={task}", "experiment=paper"])
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_the_settings_are_the_papers(task):
-    config = compose_config([f"task={task}", "experiment=paper"])
+    config = paper(task)
     labels = labelled("experiment/paper.yaml", *CHAINS[task])
     for key, (value, whose, _) in PAPER[task].items():
         assert (key, OmegaConf.select(config, key, throw_on_missing=True)) == (key, value)
@@ -142,9 +148,9 @@ def test_the_table_quotes_the_method(shared_meshes):
 
 @pytest.mark.parametrize("task", TASKS[1:])
 def test_the_surfaces_of_maps_are_the_papers(task):
-    config = compose_config([f"task={task}", "experiment=paper"])
+    config = paper(task)
     phi = compose_config(["task=overfit", *config.phi.overrides])
-    assert phi == compose_config(["experiment=paper"])
+    assert phi == paper("overfit")
 
 
 def test_a_setting_on_the_command_line_goes_before_the_papers():
@@ -156,7 +162,7 @@ def test_a_setting_on_the_command_line_goes_before_the_papers():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_schedule_ends_with_the_training(task):
-    config = compose_config([f"task={task}", "experiment=paper"])
+    config = paper(task)
     steps = config.trainer.max_steps
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
     schedule = build_scheduler(optimizer, OmegaConf.to_container(config.scheduler), steps)

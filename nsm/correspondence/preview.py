@@ -11,7 +11,7 @@ from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
 from nsm.correspondence.search import Candidate, Round, trained
 from nsm.errors import NsmError
 
-_ROUND = Round(8, 8, 60)
+_ROUNDS = (Round(8, 8, 60), Round(8, 8, 20, directed=True))
 _MOST = 8  # landmarks among which the four at the cones are chosen
 
 
@@ -79,7 +79,10 @@ def previewed(
     ]
     wanted = np.stack([s.tips[best], t.tips[best]], axis=1)
     starts = [c for c in starts if np.array_equal(c.cones(), wanted)]
-    found = trained(starts, _ROUND, np.stack([s.tips, t.tips], axis=1) if drawn else None)
+    held = np.stack([s.tips, t.tips], axis=1) if drawn else None
+    found = starts
+    for one in _ROUNDS:
+        found = trained(found, one, held)
     off = [t.distance[c.images(s.tips), t.tips] for c in found]
     # the isotopy class that other landmarks tell, and distortion
     costs = [np.log(c.energy) + 4 * miss.mean() for c, miss in zip(found, off, strict=True)]

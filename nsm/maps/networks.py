@@ -24,7 +24,7 @@ from nsm.maps.spline_field import SplineField
 
 
 class PostActivationBlock(nn.Module):
-    """act(x + L₂ act(L₁ x)): the published residual block."""
+    """act(x + L₂ act(L₁ x)): the residual block of the paper."""
 
     def __init__(self, width: int, activation: Activation) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class NeuralMap(nn.Module):
     Args:
         out_dim: 3 for a surface φ, 2 for a planar map h.
         width, depth: features of the hidden layers; number of blocks.
-        block: ``plain`` (one layer each), ``post`` (published residual), ``pre``, or a registered
+        block: ``plain`` (one layer each), ``post`` (the paper's residual), ``pre``, or a registered
             one.
         activation: a module or function (see :func:`nsm.maps.activations.as_activation`);
             softplus by default.

@@ -83,10 +83,14 @@ GIVEN = {
     "position": ((4, 3), (4, 3)),
     "unfold": ((4,),),
 }
+OF_MAPS = {
+    "area_element", "curvatures", "jacobian", "laplace_beltrami", "normals", "second_derivatives",
+    "second_fundamental_form", "surface_gradient",
+}  # fmt: skip
 # tested elsewhere: they use the above, or give no values of energies
 OTHER = {
-    "ENERGIES", "At", "Blend", "Energy", "Invariants", "call_energy", "inside",
-    "pullback_invariants", "rotation", *(kind.__name__ for kind in ENERGIES.values()),
+    "ENERGIES", "At", "Blend", "Curvatures", "Energy", "Invariants", "call_energy", "inside",
+    "pullback_invariants", "rotation", "spectrum", *(kind.__name__ for kind in ENERGIES.values()),
 }  # fmt: skip
 
 
@@ -103,6 +107,36 @@ def test_terms(name, data):
     check_finite(value, *(x for x in arguments if isinstance(x, torch.Tensor)))
 
 
+@pytest.mark.parametrize("name", sorted(OF_MAPS))
+@examples(10)
+@given(
+    bend=arrays.arrays(np.float64, 3, elements=st.floats(-1e3, 1e3)),
+    uv=arrays.arrays(np.float64, (4, 2), elements=st.floats(-1e3, 1e3)),
+)
+def test_operators_of_any_graph_and_its_mirror_image(name, bend, uv):
+    """Values are finite; mirrored in its plane, z becomes -z, and curvatures change sign."""
+    a, b, c = bend.tolist()
+    with_function = name in ("surface_gradient", "laplace_beltrami")
+    function = [lambda x: x[:, 0] ** 2 - x[:, 1]] if with_function else []
+
+    def value(sign):
+        def graph(x):
+            u, v = x.unbind(-1)
+            return torch.stack([u, v, sign * (a * u**2 + b * u * v + c * v**2)], dim=-1)
+
+        return getattr(energies, name)(graph, *function, torch.from_numpy(uv.copy()))
+
+    here, there = value(1), value(-1)
+    if name == "curvatures":
+        assert torch.allclose(here.mean, -there.mean) and torch.allclose(
+            here.gaussian, there.gaussian
+        )
+        here, there = torch.stack(here), torch.stack(there)
+    assert here.isfinite().all() and there.isfinite().all()
+    if here.ndim == 1:
+        assert torch.allclose(here, there, rtol=1e-6, atol=1e-9)
+
+
 def test_everything_public_is_tried():
-    assert set(energies.__all__) == {*GIVEN, *OTHER, *ENERGIES}
+    assert set(energies.__all__) == {*GIVEN, *OF_MAPS, *OTHER, *ENERGIES}
     assert all(callable(getattr(energies, name)) for name in GIVEN)
