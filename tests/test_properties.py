@@ -555,9 +555,10 @@ def test_what_map_collection_is_given(untrained, surfaces, landmarks):
 def test_good_landmarks_are_accepted_and_bad_ones_refused_first(untrained, pairs, data):
     ends = NEURAL[0], NEURAL[1]
     assert begins(nsm.map_pair, *ends, pairs)
-    bad = [(0, VERTICES), (-1, 0), (0, math.nan), (0, [0, 0, math.inf])]
+    bad = [(0, VERTICES), (-2, 0), (0, math.nan), (0, [0, 0, math.inf])]
     assert not begins(nsm.map_pair, *ends, [*pairs, data.draw(st.sampled_from(bad))])
     if pairs:
+        assert begins(nsm.map_pair, *ends, [*pairs, (-1, 0)])  # one that the source lacks
         twice = (pairs[0][0], next(v for v in range(9) if v not in [q for _, q in pairs]))
         assert not begins(nsm.map_pair, *ends, [*pairs, twice])
         uneven = {"source": [p for p, _ in pairs], "target": [q for _, q in pairs][:-1]}
