@@ -124,7 +124,7 @@ def test_same_seed_same_result_and_another_differs(tmp_path):
 
 
 def test_killed_and_resumed_ends_as_if_never_killed(tmp_path):
-    words = ["surface=hemisphere", *QUICK, "logger=none", "trainer.max_steps=400"]
+    words = ["surface=hemisphere", *QUICK, "logger=none", "trainer.max_steps=200"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
     killed.mkdir()

@@ -339,7 +339,7 @@ def _keep_component(
     """The faces of the component that is chosen, or of the largest beside small ones."""
     label = topology.face_components(faces)
     count = int(label.max()) + 1
-    if count == 1:
+    if count == 1 and repairs.parts in (None, "largest", 0):
         return faces
     share = np.bincount(label, weights=topology.face_areas(vertices, faces))
     share = share / share.sum()
@@ -347,7 +347,8 @@ def _keep_component(
     if repairs.parts is not None:
         number = 0 if repairs.parts == "largest" else int(repairs.parts)
         if not 0 <= number < count:
-            reason = f"surface.parts={number}: there are {count}; give 0 to {count - 1}, or largest"
+            last = f"0 to {count - 1}" if count > 1 else "0"
+            reason = f"surface.parts={number}: the mesh has {count}; give {last}, or largest"
             raise error_in(name, "out_of_range", reason)
         part = int(order[number])
         log.append(f"1 of {count} connected components kept, {100 * share[part]:.2f} % of the area")
