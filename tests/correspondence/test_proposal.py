@@ -62,7 +62,7 @@ def pair():
 @pytest.fixture
 def quick(monkeypatch):
     """A search of fewer maps, enough for shapes that are equal or nearly so."""
-    rounds = (Round(60, 3, 10), Round(10, 6, 30, directed=True))
+    rounds = (Round(60, 3, 10), Round(10, 6, 30))
     monkeypatch.setattr(search, "_SOURCE_SETS", 1)
     monkeypatch.setattr(search, "_TARGET_SETS", 6)
     monkeypatch.setattr(proposal, "candidates", lambda s, t: search.candidates(s, t, rounds))
