@@ -157,12 +157,17 @@ def _setting(key: str, value: Any) -> Setting:
 
 
 def _default_remarks(key: str) -> str:
-    """What the class of a group's default option says of one of its settings."""
+    """What the classes of a group's options say of one of its settings, the default's first."""
     from nsm.instantiation import named_object
 
     group, _, name = key.partition(".")
-    node = composed()[0].get(group) or {}
-    return remarks(named_object(node["_target_"])).get(name, "") if "_target_" in node else ""
+    files = sorted((conf_folder() / group).glob("*.yaml"))
+    options: list[Any] = [OmegaConf.create(file.read_text(encoding="utf-8")) for file in files]
+    for node in (composed()[0].get(group) or {}, *options):
+        said = remarks(named_object(node["_target_"])) if "_target_" in node else {}
+        if name in said:
+            return said[name]
+    return ""
 
 
 @cache
