@@ -102,6 +102,7 @@ def test_an_interrupt_reaches_all(tmp_path):
     def interrupt():
         while len(list(tmp_path.iterdir())) < 2:
             time.sleep(0.01)
+        time.sleep(0.5)  # logging's hooks after a fork swallow what is raised in them
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
