@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
+from typing import Generic, TypeVar
 
 from torch import Tensor
 
@@ -14,6 +15,36 @@ from nsm.data.surface import SurfaceData
 from nsm.domains import Surface
 from nsm.maps import LatticeAligned, Rotated
 from nsm.settings import Count
+
+Batch = TypeVar("Batch")
+
+
+class _Levels(Generic[Batch]):
+    """The levels of a training, and the batch of the one that was drawn last.
+
+    Args:
+        points: in the batch of each level.
+        steps: of each level but the last.
+
+    Raises:
+        ValueError: as many ``steps`` as ``points``, or more; or fewer by two.
+    """
+
+    def __init__(self, points: Sequence[int], steps: Sequence[int]) -> None:
+        if len(steps) != len(points) - 1 or min(points, default=0) < 1 or min(steps, default=0) < 0:
+            raise ValueError(
+                "data.points has one number, 1 or more, per level; data.steps one, 0 or more, per "
+                "level but the last"
+            )
+        self.counts, self.ends = list(points), list(accumulate(steps))
+        self._drawn: tuple[int, Batch] | None = None
+
+    def at(self, step: int, draw: Callable[[int, int], Batch]) -> Batch:
+        """The batch of a step's level, which ``draw`` makes once of its number and its count."""
+        level = sum(step >= end for end in self.ends)
+        if self._drawn is None or self._drawn[0] != level:
+            self._drawn = level, draw(level, self.counts[level])
+        return self._drawn[1]
 
 
 class LevelData(SurfaceData):
@@ -41,7 +72,7 @@ class LevelData(SurfaceData):
         held_out: Count = 16_384,
         seed: int = 0,
     ) -> None:
-        _check(points, steps)
+        self.levels = _Levels[Samples](points, steps)
         super().__init__(
             surface,
             sampler,
@@ -50,17 +81,15 @@ class LevelData(SurfaceData):
             held_out=held_out,
             seed=seed,
         )
-        self.counts, self.ends = list(points), list(accumulate(steps))
-        self._drawn: tuple[int, Samples] | None = None
 
     def batch(self, step: int) -> Samples:
         """The samples of a step's level; of several processes, this one's share of them."""
-        level = sum(step >= end for end in self.ends)
-        if self._drawn is None or self._drawn[0] != level:
-            generator = self.points.generator(self.seed, level)
-            whole = self.own_sampler.draw(self.points, self.counts[level], generator)
-            self._drawn = level, Samples(*(self.part.of_rows(rows) for rows in whole))
-        return self._drawn[1]
+        return self.levels.at(step, self._draw)
+
+    def _draw(self, level: int, count: int) -> Samples:
+        generator = self.points.generator(self.seed, level)
+        whole = self.own_sampler.draw(self.points, count, generator)
+        return Samples(*(self.part.of_rows(rows) for rows in whole))
 
 
 class CollectionLevelData(CollectionData):
@@ -88,7 +117,7 @@ class CollectionLevelData(CollectionData):
         held_out: Count = 8192,
         seed: int = 0,
     ) -> None:
-        _check(points, steps)
+        self.levels = _Levels[Tensor](points, steps)
         super().__init__(
             surfaces,
             starts,
@@ -98,21 +127,11 @@ class CollectionLevelData(CollectionData):
             held_out=held_out,
             seed=seed,
         )
-        self.counts, self.ends = list(points), list(accumulate(steps))
-        self._drawn: tuple[int, Tensor] | None = None
 
     def batch(self, step: int) -> Tensor:
         """The samples (N, 2) of a step's level; of several processes, this one's share of them."""
-        level = sum(step >= end for end in self.ends)
-        if self._drawn is None or self._drawn[0] != level:
-            self.share = max(1, self.counts[level] // len(self.surfaces))
-            self._drawn = level, super().batch(level)
-        return self._drawn[1]
+        return self.levels.at(step, self._draw)
 
-
-def _check(points: Sequence[int], steps: Sequence[int]) -> None:
-    if len(steps) != len(points) - 1 or min(points, default=0) < 1 or min(steps, default=0) < 0:
-        raise ValueError(
-            "data.points has one number, 1 or more, per level; data.steps one, 0 or more, per "
-            "level but the last"
-        )
+    def _draw(self, level: int, count: int) -> Tensor:
+        self.share = max(1, count // len(self.surfaces))
+        return super().batch(level)

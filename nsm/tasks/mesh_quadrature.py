@@ -41,10 +41,14 @@ class Triangles(NamedTuple):
         a, b, c = image[self.faces].unbind(dim=1)
         return torch.stack([b - a, c - a], dim=-1)
 
+    def centres_on(self, image: Tensor) -> Tensor:
+        """The centres (F, n) of the triangles with images (V, n) of the corners."""
+        return image[self.faces].mean(dim=1)
+
     @property
     def centres(self) -> Tensor:
         """(F, 2) in Ω."""
-        return self.uv[self.faces].mean(dim=1)
+        return self.centres_on(self.uv)
 
 
 class MeshQuadrature(nn.Module):

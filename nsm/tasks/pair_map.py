@@ -13,12 +13,12 @@ from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
-from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
+from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
 
 
-class PairMap(ConstrainedMap):
+class PairMap(ConstrainedMap, OneMeshMap):
     """L = mean E(A, B) + λ_inv G + λ_B B + λ_C C + λ_seam S + λ_tri U (METHOD, B, G, C).
 
     A = J_φᵀJ_φ and B = J(ψ∘h)ᵀJ(ψ∘h) at samples of the source; S = mean ‖ψ(h(a)) − ψ(h(b))‖² over
@@ -74,9 +74,7 @@ class PairMap(ConstrainedMap):
         self.image = Composition(self.psi, self.map)
         held = self.constraints
         self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
-        self.quadrature, self.triangles_from = None, held.triangles_from * max_steps
-        if held.triangles_from < 1:
-            self.quadrature = MeshQuadrature(*mesh, self.phi)
+        self._set_quadrature(held.triangles_from, max_steps, *mesh, self.phi)
         self.diagonal = diagonal
         self.set_landmarks(points, targets, self.map.before(points), seam)
 
@@ -119,16 +117,12 @@ class PairMap(ConstrainedMap):
         self.log_terms(loss, terms, distortion=energy)
         return loss
 
-    def _folding(self, e: Evaluation) -> Tensor:
-        """G: the mean over samples, or triangles by their area."""
-        assert e.source is not None and e.target is not None
-        values = self.folds(e.determinant, e.source, e.target, self.global_step)
-        return values.mean() if e.share is None else (e.share * values).sum()
-
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples of the source, and what it is made from."""
         if self.training and (some := self._triangles(batch)) is not None:
-            return self._on_triangles(some)
+            h = self.map(some.uv)
+            B = first_fundamental_form(some.sides(self.psi(h)))
+            return self._on_triangles(some, h, some.sides(h), B)
         A, B, jacobian, h = self.pointwise(self._at, batch.uv)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         if not self.exact:  # samples that h maps out of Ω do not count
@@ -136,23 +130,6 @@ class PairMap(ConstrainedMap):
             parts = {name: part[kept] for name, part in parts.items()}
         det = torch.linalg.det(jacobian)
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
-
-    def _triangles(self, batch: Samples) -> Triangles | None:
-        """Those at which the distortion of a training step is measured; None: it is at samples."""
-        if self.quadrature is None or self.global_step < self.triangles_from:
-            return None
-        return self.quadrature.take(len(batch.uv))
-
-    def _on_triangles(self, some: Triangles) -> tuple[Distortion, Evaluation]:
-        """The energy of the map that is linear on triangles of the source."""
-        h = self.map(some.uv)
-        A, B = some.metric, first_fundamental_form(some.sides(self.psi(h)))
-        centre = some.points[some.faces].mean(dim=1)
-        parts = self.energy.parts(A, B, At(some.centres, centre))
-        det = torch.linalg.det(some.sides(h)) / some.determinant
-        image = h[some.faces].mean(dim=1)
-        evaluation = Evaluation(some.centres, centre, image, A, B, det, some.oriented)
-        return Distortion(self.energy, parts, some.share), evaluation
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A, B, J_h and h at points (N, 2) of Ω."""
@@ -163,11 +140,8 @@ class PairMap(ConstrainedMap):
         return source, first_fundamental_form(outer @ jacobian), jacobian, image
 
     def curvatures(self) -> list[Curvature]:
-        uv, position, w = self.batch.uv, self.batch.points, self.loss_weights
-        share = uv.new_full((len(uv),), 1 / len(uv))
-        if (some := self._triangles(self.batch)) is not None:  # nearly theirs
-            uv, share, position = some.centres, some.share, some.points[some.faces].mean(dim=1)
-        at = At(uv, position)
+        w = self.loss_weights
+        uv, at, share = self._places(self.batch)  # of triangles, nearly theirs
         with torch.no_grad():
             source, _, jacobian, image = self._at(uv)
             outer = self.psi.value_and_jacobian(image)[1].double()  # type: ignore[operator]

@@ -12,13 +12,12 @@ from nsm.energies import At, first_fundamental_form
 from nsm.settings import ParamConstraints, ParamWeights
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier, Folds, further_training, stronger
-from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
+from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
-from nsm.tasks.training import Training
 
 
-class Param(Training):
+class Param(OneMeshMap):
     """L = mean E(A, B) + λ_inv mean G(det J_h) + λ_tri U, A = J_φᵀJ_φ, B = J_hᵀJ_h (METHOD, Param).
 
     U keeps the mesh's triangles from folding (:class:`nsm.tasks.fold_barrier.FoldBarrier`). With a
@@ -69,9 +68,7 @@ class Param(Training):
         self.loss_terms = made_terms(loss_terms or {})
         self.phi = phi.eval().requires_grad_(False)
         self.fold_barrier = FoldBarrier(*mesh, every=held.fold_every)
-        self.quadrature, self.triangles_from = None, held.triangles_from * max_steps
-        if held.triangles_from < 1:
-            self.quadrature = MeshQuadrature(*mesh[:2], self.phi)
+        self._set_quadrature(held.triangles_from, max_steps, *mesh[:2], self.phi)
         self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
@@ -98,39 +95,17 @@ class Param(Training):
         self.log_terms(loss, terms, distortion=energy)
         return loss
 
-    def _folding(self, e: Evaluation) -> Tensor:
-        """G: the mean over samples, or triangles by their area."""
-        assert e.source is not None and e.target is not None
-        values = self.folds(e.determinant, e.source, e.target, self.global_step)
-        return values.mean() if e.share is None else (e.share * values).sum()
-
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples, and what it is made from; φ's part is not recorded."""
         if self.training and (some := self._triangles(batch)) is not None:
-            return self._on_triangles(some)
+            h = self.map(some.uv)
+            sides = some.sides(h)
+            return self._on_triangles(some, h, sides, first_fundamental_form(sides))
         A, jacobian, h = self.pointwise(self._at, batch.uv)
         B = first_fundamental_form(jacobian)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         det = torch.linalg.det(jacobian)
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
-
-    def _triangles(self, batch: Samples) -> Triangles | None:
-        """Those at which the distortion of a training step is measured; None: it is at samples."""
-        if self.quadrature is None or self.global_step < self.triangles_from:
-            return None
-        return self.quadrature.take(len(batch.uv))
-
-    def _on_triangles(self, some: Triangles) -> tuple[Distortion, Evaluation]:
-        """The energy of the map that is linear on triangles."""
-        h = self.map(some.uv)
-        sides = some.sides(h)
-        A, B = some.metric, first_fundamental_form(sides)
-        centre = some.points[some.faces].mean(dim=1)
-        parts = self.energy.parts(A, B, At(some.centres, centre))
-        det = torch.linalg.det(sides) / some.determinant
-        image = h[some.faces].mean(dim=1)
-        evaluation = Evaluation(some.centres, centre, image, A, B, det, some.oriented)
-        return Distortion(self.energy, parts, some.share), evaluation
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A, J_h and h at points (N, 2) of Ω."""
@@ -140,11 +115,8 @@ class Param(Training):
         return source, jacobian, h
 
     def curvatures(self) -> list[Curvature]:
-        uv, position, w = self.batch.uv, self.batch.points, self.loss_weights
-        share = uv.new_full((len(uv),), 1 / len(uv))
-        if (some := self._triangles(self.batch)) is not None:  # nearly theirs
-            uv, share, position = some.centres, some.share, some.points[some.faces].mean(dim=1)
-        at = At(uv, position)
+        w = self.loss_weights
+        uv, at, share = self._places(self.batch)  # of triangles, nearly theirs
         with torch.no_grad():
             source, jacobian, _ = self._at(uv)
 
