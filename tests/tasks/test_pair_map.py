@@ -169,7 +169,7 @@ def test_multipliers_meet_landmarks_better_than_a_fixed_weight():
             landmarks=kind,
             weights={"landmarks": 10.0},
         )
-        off[kind] = (optimise(module, 800, every=25)(points) - targets).norm().item()
+        off[kind] = (optimise(module, 250)(points) - targets).norm().item()
     assert off["augmented"] < 0.3 * off["fixed"]
 
 
@@ -306,7 +306,8 @@ def test_the_paper_sums_over_all_ordered_pairs():
 def test_a_collection_meets_its_landmarks_on_every_surface():
     points = torch.tensor([[0.2, 0.1]])
     targets = torch.tensor([[[0.3, 0.1]], [[0.1, 0.1]], [[0.2, 0.2]]])
-    module = optimise(collection(["plane", "saddle", "sphere_cap"], points, targets), 700)
+    module = collection(["plane", "saddle", "sphere_cap"], points, targets)
+    optimise(module, 200, every=20)
     assert (module(points) - targets).norm(dim=2).max() < 0.01
 
 

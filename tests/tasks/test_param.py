@@ -6,6 +6,7 @@ import ezdxf
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import nn
 
 import nsm
@@ -15,6 +16,7 @@ from nsm.domains.baselines import BASELINES
 from nsm.energies import SymmetricDirichlet
 from nsm.errors import NsmError
 from nsm.results import planar_metrics
+from nsm.surfaces import shapes
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
@@ -142,16 +144,24 @@ def test_libigl_flattens_a_bent_sheet_isometrically(name):
     assert figures["flipped_percent"] == 0
 
 
+HEMISPHERE = shapes.hemisphere(10)
+LITTLE = [
+    "data.batch_size=512",
+    "data.held_out=512",
+    "data.steps_per_epoch=50",
+    "encoding.resolutions=[4,16]",
+]
+
+
 @pytest.fixture(scope="module")
 def phi() -> nsm.NeuralSurface:
     # from Tutte's embedding, as SLIM on the disc leaves hardly anything to lower
-    vertices, faces = catalogue_mesh("hemisphere")
-    surface = Surface.from_arrays(vertices, faces, name="hemisphere", parameterization="tutte")
-    overrides = ["experiment=quick", "trainer.max_steps=300"]
+    surface = Surface.from_arrays(*HEMISPHERE, name="hemisphere", parameterization="tutte")
+    overrides = ["experiment=quick", *LITTLE, "trainer.max_steps=100"]
     return nsm.overfit(surface, overrides=overrides, progress=False)
 
 
-QUICK = ["trainer.max_steps=200", "data.steps_per_epoch=50", "encoding.resolutions=[4,16]"]
+QUICK = [*LITTLE, "trainer.max_steps=200"]
 
 
 def test_parameterize_lowers_distortion_and_is_given_back(phi, tmp_path):
@@ -179,26 +189,19 @@ def test_parameterize_lowers_distortion_and_is_given_back(phi, tmp_path):
     assert error.value.kind == "damaged_file"
 
 
-def test_the_command_makes_and_keeps_the_neural_surface(tmp_path, monkeypatch, capfd):
-    import sys
-
-    from nsm import cli
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NSM_CACHE", str(tmp_path / "cache"))
-    words = ["task=param", "surface=hemisphere", *QUICK, "logger=none"]
-    quick = 'phi.overrides=["experiment=quick","trainer.max_steps=100"]'
+def test_the_command_makes_and_keeps_the_neural_surface(tmp_path, here):
+    vertices, faces = HEMISPHERE
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "hemisphere.obj")
+    words = ["task=param", "surface.path=hemisphere.obj", *LITTLE, "trainer.max_steps=2"]
+    words += ["logger=none", "artefacts=false"]
+    few = 'phi.overrides=["experiment=quick","data.held_out=512","trainer.max_steps=2"]'
     for attempt in ("made", "cached"):
-        monkeypatch.setattr(sys, "argv", ["nsm", *words, quick])
-        cli.main()
-        out = capfd.readouterr().out
-        assert ("neural surface taken from the cache" in out) == (attempt == "cached")
-        assert "SLIM (libigl)" in out
-    monkeypatch.setattr(sys, "argv", ["nsm", *words, "phi.path=nowhere"])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert stop.value.code == 2
-    assert len(capfd.readouterr().err.strip().splitlines()) == 1
+        result = here(*words, few)
+        assert result.returncode == 0, result.stderr
+        assert ("neural surface taken from the cache" in result.stdout) == (attempt == "cached")
+        assert "SLIM (libigl)" in result.stdout
+    result = here(*words, "phi.path=nowhere")
+    assert (result.returncode, len(result.stderr.strip().splitlines())) == (2, 1)
 
 
 def test_the_bijective_mode_covers_the_domain_once(phi):
