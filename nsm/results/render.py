@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 Blend = Callable[[np.ndarray], np.ndarray]
 
 _SUPERSAMPLING = 2
-_CHUNK = 4_000_000  # pixel tests at once
+_CHUNK = 4_000_000  # pixels in the boxes around the triangles of one pass
+_SLACK = 1e-9  # of a barycentric coordinate: rounding leaves no pixel out
 _LIGHT = np.array([-0.35, 0.55, 0.75]) / np.linalg.norm([-0.35, 0.55, 0.75])
 
 
@@ -68,10 +69,13 @@ def rasterise(
         coordinates (P, 3).
     """
     pixel, face, weights = covering(xy, faces, size)
-    near = (weights * depth[faces[face]]).sum(axis=1)
-    order = np.lexsort((near, pixel))
-    last = np.flatnonzero(np.diff(pixel[order], append=-1))
-    chosen = order[last]
+    near = np.einsum("pk,pk->p", weights, depth[faces[face]])
+    nearest = np.full(size * size, -np.inf)
+    np.fmax.at(nearest, pixel, near)
+    of_pixel = np.full(size * size, -1)
+    seen = np.flatnonzero(near == nearest[pixel])
+    of_pixel[pixel[seen]] = seen  # of several at one depth the last
+    chosen = of_pixel[of_pixel >= 0]
     return pixel[chosen], face[chosen], weights[chosen]
 
 
@@ -83,43 +87,59 @@ def covering(
     corners = xy[faces]
     # skip triangles that are not finite or far larger than the picture
     visible = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < 4 * size).all(axis=(1, 2))
-    kept = np.where(visible[:, None, None], corners, 0.0)
-    low = np.floor(kept.min(axis=1)).astype(np.int64)
-    span = (np.ceil(kept.max(axis=1)).astype(np.int64) - low).max(axis=1) + 1
-    side = 2 ** np.ceil(np.log2(span)).astype(np.int64)
-    nothing = np.zeros(0, dtype=np.int64)
-    hits: list[tuple[np.ndarray, ...]] = [(nothing, nothing, np.zeros((0, 3)))]
-    for width in np.unique(side[visible]):
-        group = np.flatnonzero(visible & (side == width))
-        step = np.stack(np.meshgrid(np.arange(width), np.arange(width)), axis=-1).reshape(-1, 2)
-        chunk = max(1, _CHUNK // len(step))
-        for start in range(0, len(group), chunk):
-            face = group[start : start + chunk]
-            hits.append(_covered(corners[face], low[face], step, size, face))
+    kept = np.flatnonzero(visible)
+    low = np.clip(np.floor(corners[kept].min(axis=1)), 0, size).astype(np.int64)
+    high = np.clip(np.ceil(corners[kept].max(axis=1)), 0, size).astype(np.int64)
+    part = np.cumsum((high - low).prod(axis=1)) // _CHUNK
+    starts = np.flatnonzero(np.diff(part, prepend=-1))
+    hits = []
+    for some in np.split(np.arange(len(kept)), starts[1:]):
+        face = kept[some]
+        hits.append(_covered(corners[face], low[some], high[some], size, face))
     pixel, face, weights = (np.concatenate(parts) for parts in zip(*hits, strict=True))
     return pixel, face, weights
 
 
 def _covered(
-    corners: np.ndarray,
-    low: np.ndarray,
-    step: np.ndarray,
-    size: int,
-    face: np.ndarray,
+    corners: np.ndarray, low: np.ndarray, high: np.ndarray, size: int, face: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    place = low[:, None, :] + step
-    p = place + 0.5
-    a, b, c = (corners[:, None, k, :] for k in range(3))
+    """What triangles (F, 3, 2) cover of the pixels from ``low`` to before ``high`` (F, 2).
+
+    Along a row each barycentric coordinate is slope · x + offset, so that only the pixels between
+    the roots are looked at.
+    """
+    a, b, c = (corners[:, k] for k in range(3))
     area = _cross(b - a, c - a)
     with np.errstate(divide="ignore", invalid="ignore"):
-        w1, w2 = _cross(p - a, c - a) / area, _cross(b - a, p - a) / area
-        w0 = 1 - w1 - w2
-    inside = (w0 >= 0) & (w1 >= 0) & (w2 >= 0)  # false for NaN: triangles seen edge-on
-    inside &= ((place >= 0) & (place < size)).all(axis=-1)
-    i, j = np.nonzero(inside)
-    weights = np.stack([w0[i, j], w1[i, j], w2[i, j]], axis=1)
-    pixel = place[i, j, 1] * size + place[i, j, 0]
-    return pixel, face[i], weights
+        # the gradients of w1 and w2; not finite for triangles seen edge-on, which cover nothing
+        slope1, slope2 = (
+            np.stack([e[:, 1], -e[:, 0]], axis=1) / area[:, None] for e in (c - a, a - b)
+        )
+        slopes = np.stack([-slope1 - slope2, slope1, slope2])
+    covers = np.isfinite(slopes).all(axis=(0, 2))
+    row, of = _ranges(low[:, 1], np.where(covers, high[:, 1], low[:, 1]))
+    slopes = slopes[:, of]
+    first, last = low[of, 0].astype(float), high[of, 0] - 1.0
+    y = row + 0.5 - a[of, 1]
+    for k in range(3):
+        slope, offset = slopes[k, :, 0], (k == 0) + slopes[k, :, 1] * y
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = a[of, 0] - (offset + _SLACK) / slope - 0.5
+        np.copyto(first, np.ceil(root), where=(slope > 0) & (root > first))
+        np.copyto(last, np.floor(root), where=(slope < 0) & (root < last))
+    column, line = _ranges(first.astype(np.int64), last.astype(np.int64) + 1)
+    x, y, of = column + 0.5 - a[of[line], 0], y[line], of[line]
+    w1, w2 = (slope[of, 0] * x + slope[of, 1] * y for slope in (slope1, slope2))
+    weights = np.stack([1 - w1 - w2, w1, w2], axis=1)
+    inside = (weights >= 0).all(axis=1)
+    return (row[line] * size + column)[inside], face[of[inside]], weights[inside]
+
+
+def _ranges(first: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The whole numbers of each range [first, end), in turn, and which range each is of."""
+    count = np.maximum(end - first, 0)
+    of = np.repeat(np.arange(len(count)), count)
+    return np.arange(len(of)) - (np.cumsum(count) - count - first)[of], of
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -165,7 +185,7 @@ class View:
         corners = faces[face]
 
         def blend(values: np.ndarray) -> np.ndarray:
-            return (weights[:, :, None] * values[corners]).sum(axis=1)
+            return np.einsum("pk,pkd->pd", weights, values[corners])
 
         base = colours(blend)
         normal = blend(vertex_normals(turned, faces, seam_pairs))
@@ -175,8 +195,9 @@ class View:
         shine = 0.12 * np.clip(facing @ (_LIGHT + [0, 0, 1]) / 1.87, 0, 1) ** 24
         picture = np.ones((fine * fine, 3))
         picture[pixel] = np.clip(base * lit[:, None] + shine[:, None], 0, 1)
-        blocks = picture.reshape(self.size, _SUPERSAMPLING, self.size, _SUPERSAMPLING, 3)
-        return blocks.mean(axis=(1, 3))
+        parts = picture.reshape(self.size, _SUPERSAMPLING, self.size, _SUPERSAMPLING, 3)
+        finer = np.ndindex(_SUPERSAMPLING, _SUPERSAMPLING)
+        return np.mean([parts[:, i, :, j] for i, j in finer], axis=0)
 
 
 def vertex_normals(
