@@ -24,14 +24,15 @@ from nsm.results.metrics import evaluate
 QUICK = [
     "experiment=quick",
     "data.steps_per_epoch=50",
+    "data.batch_size=512",
     "data.held_out=512",
     "trainer.threads=1",
     "encoding.resolutions=[8,16]",
-    "trainer.max_steps=150",
+    "trainer.max_steps=100",
 ]
 MADE = (
     'phi.overrides=["experiment=quick","trainer.threads=1","encoding.resolutions=[16,64]",'
-    '"trainer.max_steps=40"]'
+    '"data.batch_size=512","data.held_out=512","trainer.max_steps=20"]'
 )
 
 
@@ -188,7 +189,8 @@ def test_ready_surfaces_of_their_own_cones_are_aligned(shapes):
         files[1], domain="orbifold", cones=[tips[k] for k in (2, 3, 0, 1)], cache=False
     )
     overrides = ["experiment=quick", "trainer.threads=1", "artefacts=false"]
-    overrides += ["encoding.resolutions=[16,64]", "trainer.max_steps=40"]
+    overrides += ["encoding.resolutions=[16,64]", "data.batch_size=512", "data.held_out=512"]
+    overrides += ["trainer.max_steps=20"]
     phi, psi = (nsm.overfit(s, overrides=overrides, progress=False) for s in (first, second))
     pairs = [[v, v] for v in marks]
     overrides = [*QUICK, "artefacts=false"]
@@ -212,7 +214,7 @@ def test_collections_are_certified_and_their_cycles_close(shapes, tmp_path, doma
     files, marks = shapes[domain]
     third = trimesh.load(files[0], process=False)
     path = _exported(tmp_path, "third", third.vertices[:, [1, 2, 0]] * [1, 1.2, 1], third.faces)
-    overrides = [f"domain={domain}", *QUICK, MADE, "trainer.max_steps=100"]
+    overrides = [f"domain={domain}", *QUICK, MADE, "trainer.max_steps=60"]
     folder = tmp_path / "run"
     g = nsm.map_collection(
         [*files, path], [marks] * 3, overrides=overrides, folder=folder, progress=False
@@ -262,7 +264,7 @@ def test_ready_surfaces_of_different_genus_are_refused(shapes):
     """Both cut to a disc, where a map would be torn."""
     ball, ring = (Surface.load(shapes[kind][0][0], cache=False) for kind in ("orbifold", "torus"))
     assert (ball.topology, ring.topology) == ((0, 0), (1, 0))
-    overrides = ["experiment=quick", "trainer.max_steps=2", "artefacts=false"]
+    overrides = ["experiment=quick", "data.held_out=512", "trainer.max_steps=2", "artefacts=false"]
     phis = [nsm.overfit(s, overrides=overrides, progress=False) for s in (ball, ring)]
     with pytest.raises(NsmError) as error:
         nsm.map_pair(*phis, progress=False)

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -35,10 +36,11 @@ WORDS += ["encoding.resolutions=[8]", "trainer.threads=1", "logger=none", "artef
 WORDS += ["trainer.progress=false", "trainer.max_steps=60"]
 
 
-@pytest.fixture
-def surface(monkeypatch):
-    monkeypatch.setattr(Disc, "mesh", lambda self, rings=6: ring_mesh(6))
-    plain = analytic_surface({"name": "paraboloid"}, Disc()).surface
+@pytest.fixture(scope="module")
+def surface():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Disc, "mesh", lambda self, rings=6: ring_mesh(6))
+        plain = analytic_surface({"name": "paraboloid"}, Disc()).surface
     return replace(plain, quality={"median_symmetric_dirichlet": 4.0})
 
 
@@ -199,10 +201,11 @@ def killed_at(call, name):
     setattr(os, name, deadly)
 
 
-@pytest.fixture
-def whole(surface, tmp_path):
-    run(surface, tmp_path / "whole")
-    return weights(tmp_path / "whole")
+@pytest.fixture(scope="module")
+def whole(surface, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    run(surface, folder)
+    return weights(folder)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
@@ -373,9 +376,9 @@ def test_an_artefact_written_over_another_is_the_one_or_the_other(tmp_path, call
 
 
 @pytest.mark.parametrize("part", ["state_dict", "optimizer_states", "loops", "callbacks"])
-def test_a_checkpoint_of_another_make_is_refused(surface, tmp_path, part):
+def test_a_checkpoint_of_another_make_is_refused(surface, few_steps, tmp_path, part):
     """As of a stranger, or of a network that has other layers."""
-    run(surface, tmp_path, "trainer.max_steps=10")
+    shutil.copytree(few_steps, tmp_path, dirs_exist_ok=True)
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)
     state[part] = {name: 3 for name in state[part]} if part == "callbacks" else {"x": 1}
     torch.save(state, tmp_path / "last.ckpt")
@@ -388,7 +391,7 @@ def test_a_checkpoint_of_another_make_is_refused(surface, tmp_path, part):
 # --- full disks --------------------------------------------------------------------------------
 
 
-def test_a_full_disk_leaves_the_checkpoint_before(surface, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_checkpoint_before(surface, whole, tmp_path):
     import pytorch_lightning as pl
 
     save = pl.Trainer.save_checkpoint
@@ -407,9 +410,8 @@ def test_a_full_disk_leaves_the_checkpoint_before(surface, tmp_path, monkeypatch
     assert error.value.kind == "unwritable_file" and "\n" not in str(error.value)
     assert torch.load(tmp_path / "full" / "last.ckpt", weights_only=True)["global_step"] == 30
     assert not list((tmp_path / "full").glob("*.tmp"))
-    run(surface, tmp_path / "whole")
     run(surface, tmp_path / "full", resuming=True)
-    assert same(weights(tmp_path / "full"), weights(tmp_path / "whole"))
+    assert same(weights(tmp_path / "full"), whole)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs limits of the system")
@@ -481,17 +483,26 @@ def scarce(monkeypatch, error, fits):
     monkeypatch.setattr(NeuralMap, "value_and_jacobian", limited)
 
 
+FEW = "trainer.max_steps=10"
+
+
+@pytest.fixture(scope="module")
+def few_steps(surface, tmp_path_factory):
+    """A run of few steps on whole batches."""
+    folder = tmp_path_factory.mktemp("few")
+    run(surface, folder, FEW)
+    assert told(folder) == {"rollbacks": [], "batch_parts": 1}
+    return folder
+
+
 @pytest.mark.parametrize("error", SHORTAGES.values(), ids=SHORTAGES.keys())
 def test_a_batch_that_does_not_fit_is_halved_to_the_same_result(
-    surface, tmp_path, monkeypatch, error
+    surface, few_steps, tmp_path, monkeypatch, error
 ):
-    few = "trainer.max_steps=10"
-    run(surface, tmp_path / "whole", few)
-    assert told(tmp_path / "whole") == {"rollbacks": [], "batch_parts": 1}
     scarce(monkeypatch, error, fits=20)
-    run(surface, tmp_path / "parts", few)
-    assert told(tmp_path / "parts")["batch_parts"] == 4  # 64 points in parts of 16
-    a, b = weights(tmp_path / "whole"), weights(tmp_path / "parts")
+    run(surface, tmp_path, FEW)
+    assert told(tmp_path)["batch_parts"] == 4  # 64 points in parts of 16
+    a, b = weights(few_steps), weights(tmp_path)
     for key in a:
         assert torch.allclose(a[key], b[key], rtol=1e-3, atol=1e-4), key
 

@@ -28,8 +28,17 @@ from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.shapes import grid_mesh
 from nsm.surfaces.textures import read_texture
 
-QUICK = ["experiment=quick", "data.steps_per_epoch=50", "data.held_out=512", "trainer.threads=1"]
-MADE = 'phi.overrides=["experiment=quick","trainer.threads=1"]'
+QUICK = [
+    "experiment=quick",
+    "data.steps_per_epoch=50",
+    "data.batch_size=512",
+    "data.held_out=512",
+    "trainer.threads=1",
+]
+MADE = (
+    'phi.overrides=["experiment=quick","trainer.threads=1","data.batch_size=512",'
+    '"data.held_out=512","trainer.max_steps=30"]'
+)
 PENALTY = [
     "constraints.boundary=penalty",
     "constraints.landmarks=fixed",
@@ -70,7 +79,7 @@ def made(files, tmp_path_factory):
         files / "ball.obj",
         files / "egg.obj",
         files / "pairs.json",
-        overrides=[*QUICK, MADE, SEAM, "trainer.max_steps=200"],
+        overrides=[*QUICK, MADE, SEAM, "trainer.max_steps=100"],
         folder=folder,
         progress=False,
     )
@@ -209,7 +218,7 @@ def test_a_file_with_copies_of_vertices_in_other_units(made, files, tmp_path):
     points = 2 * np.concatenate([egg.vertices, egg.vertices, [[0, 0, 0]]])  # the last in no face
     trimesh.Trimesh(points, copied, process=False).export(tmp_path / "egg in cm.obj")
     pairs = [(i, j + n * (j % 2)) for i, j in f.landmarks.tolist()]
-    settings = [*QUICK, MADE, SEAM, "trainer.max_steps=200"]
+    settings = [*QUICK, MADE, SEAM, "trainer.max_steps=100"]
     place = [files / "ball.obj", tmp_path / "egg in cm.obj"]
     g = nsm.map_pair(*place, pairs, overrides=settings, progress=False)
     assert g.target.surface.name == "egg in cm"
@@ -291,7 +300,7 @@ def test_analytic_targets_and_no_landmarks(here, domain):
         f"domain={domain}",
         *QUICK,
         MADE,
-        "trainer.max_steps=60",
+        "trainer.max_steps=30",
         "logger=none",
         "artefacts=false",
     )
@@ -340,7 +349,7 @@ def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
     count = len(nsm.Surface.load("hemisphere").vertices)
     np.save(tmp_path / "heat.npy", np.linspace(0, 1, count))
     words = ["task=pair_map", "source=hemisphere", "target=sphere_cap", *QUICK, MADE]
-    words += ["trainer.max_steps=10", "logger=none", "artefacts=false"]
+    words += ["trainer.max_steps=10", "landmarks=[]", "logger=none", "artefacts=false"]
     run = here(*words, "attributes.source=heat.npy")
     assert run.returncode == 0, run.stderr
     folder = run.stdout.strip().splitlines()[-1].removeprefix("results in ")
@@ -350,7 +359,8 @@ def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
 
 def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch):
     _, f = made
-    words = [*QUICK, "trainer.max_steps=100", "logger=none", "artefacts=false"]
+    words = [*QUICK, "data.steps_per_epoch=10", "trainer.max_steps=20"]
+    words += ["logger=none", "artefacts=false"]
 
     def run(folder, **extra):
         config = compose_config(["task=pair_map", "trainer.progress=false", *words])
@@ -358,14 +368,14 @@ def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch)
         return run_task(config, folder, given, **extra)
 
     whole = run(tmp_path / "whole")
-    # the same, stopped in the middle: the checkpoint of step 50
+    # the same, stopped in the middle: the checkpoint of step 10
     from nsm.results import callbacks
 
     written = callbacks.AtomicCheckpoint.on_train_epoch_end
 
     def stop(self, trainer, module):
         written(self, trainer, module)
-        if trainer.global_step == 50:
+        if trainer.global_step == 10:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
@@ -385,7 +395,10 @@ def folder_of_trio(tmp_path_factory):
 def trio(folder_of_trio):
     return nsm.map_collection(
         ["hemisphere", "saddle", "cone"],
-        overrides=[*QUICK, MADE, "trainer.max_steps=150", "logger=csv", "artefacts=false"],
+        overrides=[
+            *(*QUICK, MADE, "trainer.max_steps=60", "data.steps_per_epoch=20"),
+            *("logger=csv", "artefacts=false"),
+        ],
         folder=folder_of_trio,
         progress=False,
     )
@@ -444,7 +457,7 @@ def test_closed_shapes_are_put_into_a_collection_through_their_landmarks(files):
     group = nsm.map_collection(
         [files / f"{n}.obj" for n in names],
         [files / f"{n}.vts" for n in names],
-        overrides=[*QUICK, MADE, SEAM, "trainer.max_steps=100"],
+        overrides=[*QUICK, MADE, SEAM, "trainer.max_steps=50"],
         progress=False,
     )
     for figures in group.metrics["pairs"].values():
@@ -464,8 +477,9 @@ def test_textures_are_carried_both_ways_by_the_command(here, tmp_path):
     run = here(
         *QUICK,
         MADE,
-        *("task=pair_map", "source=ball.obj", "target=egg.obj", "texture=own", "texture_size=64"),
-        *("trainer.max_steps=3", "logger=none", "trainer.progress=false", "artefacts=false"),
+        *("task=pair_map", "source=ball.obj", "target=egg.obj", "landmarks=[]"),
+        *("texture=own", "texture_size=64", "trainer.max_steps=3", "logger=none"),
+        *("trainer.progress=false", "artefacts=false"),
         "hydra.run.dir=run",
     )
     assert run.returncode == 0, run.stderr
@@ -503,7 +517,7 @@ BAD = [
     ("target=old", "wrong_version", "surface.json"),
     ("constraints.boundary=soft", "unknown_option", "constraints.boundary"),
     ("seam.path=sideways landmarks=[[1,1],[5,5]]", "unknown_option", "seam.path"),
-    ("attributes.source=a.vts", "unreadable_file", "attributes.source"),
+    ("attributes.source=a.vts landmarks=[]", "unreadable_file", "attributes.source"),
     ("texture=own", "missing_texture", "a.obj"),
     ("texture=nowhere.png", "missing_file", "nowhere.png"),
     ("texture=broken.json", "unreadable_file", "broken.json"),
