@@ -153,21 +153,25 @@ def known_keys() -> list[str]:
 def _setting(key: str, value: Any) -> Setting:
     if key.startswith("hydra.sweeper.params."):
         return Setting(key, _yaml(value), "the values of the sweep")
-    return Setting(key, _yaml(value), _plain_remarks().get(key) or _default_remarks(key))
+    remark = _plain_remarks().get(key)
+    if not remark:
+        group, _, name = key.partition(".")
+        remark = _option_remarks(group).get(name, "")
+    return Setting(key, _yaml(value), remark)
 
 
-def _default_remarks(key: str) -> str:
-    """What the classes of a group's options say of one of its settings, the default's first."""
+@cache
+def _option_remarks(group: str) -> dict[str, str]:
+    """What the classes of a group's options say of its settings, the default's first."""
     from nsm.instantiation import named_object
 
-    group, _, name = key.partition(".")
     files = sorted((conf_folder() / group).glob("*.yaml"))
     options: list[Any] = [OmegaConf.create(file.read_text(encoding="utf-8")) for file in files]
+    found: dict[str, str] = {}
     for node in (composed()[0].get(group) or {}, *options):
         said = remarks(named_object(node["_target_"])) if "_target_" in node else {}
-        if name in said:
-            return said[name]
-    return ""
+        found = said | found
+    return found
 
 
 @cache

@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override
+from omegaconf import DictConfig, OmegaConf
+
+from nsm import api
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -71,6 +77,25 @@ def run_python(page: Path, names: dict[str, Any] | None = None) -> dict[str, Any
         code = compile("\n" * block.line + block.text, str(page), "exec")
         exec(code, names)
     return names
+
+
+@contextmanager
+def short_trainings() -> Iterator[None]:
+    """What functions of :mod:`nsm.api` train takes few steps on few samples, whatever is asked."""
+    few = {"trainer.max_steps": 20, "data.batch_size": 512, "data.held_out": 512}
+
+    def shortened(*given: Any, **settings: Any) -> DictConfig:
+        config = compose(*given, **settings)
+        for key, most in few.items():
+            if (asked := OmegaConf.select(config, key)) is not None:
+                OmegaConf.update(config, key, min(asked, most))
+        config.phi.overrides = [*config.phi.overrides, *(f"{k}={v}" for k, v in few.items())]
+        return config
+
+    with pytest.MonkeyPatch.context() as patch:
+        compose = api.compose_config
+        patch.setattr(api, "compose_config", shortened)
+        yield
 
 
 def commands(page: Path) -> list[list[str]]:

@@ -11,7 +11,18 @@ from pathlib import Path
 
 import pytest
 import yaml
-from doc_pages import PAGES, ROOT, blocks, commands, inline_code, jobs, overrides, prose, run_python
+from doc_pages import (
+    PAGES,
+    ROOT,
+    blocks,
+    commands,
+    inline_code,
+    jobs,
+    overrides,
+    prose,
+    run_python,
+    short_trainings,
+)
 
 import nsm
 from nsm.config import compose_config
@@ -56,7 +67,8 @@ def test_blocks_name_their_language(page):
 @pytest.mark.parametrize("page", [p for p in PLAIN if blocks(p, "python")], ids=by_name)
 def test_python_runs_as_it_stands(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run_python(page)
+    with short_trainings():
+        run_python(page)
 
 
 def test_each_public_function_has_an_example():

@@ -116,25 +116,24 @@ def test_same_seed_same_result_and_another_differs(tmp_path):
     weights = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         surface = nsm.Surface.load("hemisphere", cache=False)
-        overrides = [*QUICK, "trainer.max_steps=50", "logger=none", f"seed={seed}"]
+        overrides = [*QUICK, "trainer.max_steps=10", "logger=none", "artefacts=false"]
+        overrides.append(f"seed={seed}")
         nsm.overfit(surface, overrides=overrides, folder=tmp_path / name, progress=False)
         weights.append(nsm.load(tmp_path / name).map.state_dict())
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert not all(torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
 
 
-def test_killed_and_resumed_ends_as_if_never_killed(tmp_path):
-    words = ["surface=hemisphere", *QUICK, "logger=none", "trainer.max_steps=200"]
+def test_killed_and_resumed_ends_as_if_never_killed(tmp_path, here, monkeypatch):
+    words = ["surface=hemisphere", *QUICK, "data.steps_per_epoch=10", "trainer.max_steps=60"]
+    words += ["logger=none", "artefacts=false"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
     killed.mkdir()
-    assert run(whole, *words).returncode == 0
+    monkeypatch.chdir(whole)
+    assert here(*words).returncode == 0
     process = subprocess.Popen(
-        command(*words),
-        cwd=killed,
-        env={**os.environ, "NSM_CACHE": str(killed / "cache")},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        command(*words), cwd=killed, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     deadline = time.monotonic() + 120
     while not list(killed.glob("outputs/overfit/*/last.ckpt")):
@@ -145,7 +144,8 @@ def test_killed_and_resumed_ends_as_if_never_killed(tmp_path):
     process.wait()
     folder = only_run_folder(killed)
     assert not (folder / "metrics.json").exists()
-    result = run(killed, f"resume={folder}")
+    monkeypatch.chdir(killed)
+    result = here(f"resume={folder}")
     assert result.returncode == 0, result.stderr
     a = nsm.load(only_run_folder(whole)).map.state_dict()
     b = nsm.load(folder).map.state_dict()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from doc_pages import short_trainings
 from hydra.core.config_store import ConfigStore
 from torch import nn
 
@@ -41,8 +42,9 @@ def page():
     """The names that the page's examples leave, run in turn as a reader would."""
     module = types.ModuleType("mine")
     sys.modules["mine"] = module
-    for block in EXAMPLES:
-        exec(block, module.__dict__)
+    with short_trainings():
+        for block in EXAMPLES:
+            exec(block, module.__dict__)
     yield module.__dict__
     del sys.modules["mine"]
 
