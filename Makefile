@@ -10,7 +10,7 @@ demo: .venv/.nsm
 	@echo "now: . .venv/bin/activate, and then nsm mine.obj; or .venv/bin/nsm mine.obj"
 
 test: check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: .venv/.nsm-dev
 	$(BIN)/ruff check nsm hydra_plugins tests benchmarks docs

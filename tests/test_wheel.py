@@ -44,7 +44,8 @@ def test_it_runs_from_another_folder(installed, tmp_path):
     )
     assert str(ROOT) not in where.stdout, "the clone was imported instead of the wheel"
     assert Path(where.stdout.strip()).name == "conf"
-    settings = ["surface=hemisphere", "experiment=quick", "trainer.max_steps=50", "logger=none"]
+    settings = ["surface=hemisphere", "experiment=quick", "trainer.max_steps=5", "logger=none"]
+    settings += ["data.held_out=512", "artefacts=false"]
     result = subprocess.run(
         [installed, "-m", "nsm.cli", *settings],
         cwd=tmp_path,

@@ -38,7 +38,7 @@ POINTS = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
 @pytest.fixture(scope="module")
 def pair():
     """A ball, and the same stretched and finer, with six landmarks each."""
-    a, b = ball(3), ball(4)
+    a, b = ball(2), ball(3)
     stretched = b[0] * [1.0, 1.5, 0.8]
     ids = [nearest(a[0], POINTS), nearest(b[0], POINTS)]
     return [Mesh("ball", *a), Mesh("egg", stretched, b[1])], ids
