@@ -18,12 +18,13 @@ SCRIPT = """
 import json, sys
 from pathlib import Path
 import nsm
+from nsm.surfaces.shapes import hemisphere
 
 folder = Path(sys.argv[1])
 short = ["trainer.max_steps=12", "data.steps_per_epoch=6", "data.held_out=256", "map.width=16",
          "optimizer=sgd", "optimizer.lr=0.02", "artefacts=false", "logger=csv",
          "trainer.log_every=3"]
-surface = nsm.Surface.load("saddle", parameterization="tutte", cache=False)
+surface = nsm.Surface.from_arrays(*hemisphere(8), parameterization="tutte", cache=False)
 phis = [
     nsm.overfit(surface, folder=folder / f"overfit_{n}", progress=False,
                 overrides=[*short, "data.batch_size=128", f"trainer.devices={n}"])
@@ -31,7 +32,7 @@ phis = [
 ]
 words = [*short, "data.batch_size=96", "certification.repair=false", "optimizer.lr=0.0005"]
 for n in (1, 2):
-    nsm.map_pair(phis[0], phis[1], [(7, 7), (900, 900), (1500, 1500)],
+    nsm.map_pair(phis[0], phis[1], [(7, 7), (100, 100), (180, 180)],
                  folder=folder / f"pair_{n}", progress=False,
                  overrides=[*words, "constraints.boundary=penalty", f"trainer.devices={n}"])
 """
