@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
-OPTIONAL = ("lattice", "ends")
+OPTIONAL = ("lattice", "ends", "caps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,8 @@ class Surface:
         ends: of open meshes cut together, (1 + J,) int64: a number that is the same for all of
             these, and the vertices of the mesh file at which the cuts end on the boundaries, which
             correspond. None elsewhere.
+        caps: (F,) bool, the faces of caps that close the boundaries of a part for a map into a whole
+            shape (see :meth:`part`); None: there are none.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
             an analytic surface, and for one that an older version stored.
     """
@@ -80,6 +83,7 @@ class Surface:
     log: tuple[str, ...] = field(default=(), repr=False)
     lattice: np.ndarray | None = field(default=None, repr=False)
     ends: np.ndarray | None = field(default=None, repr=False)
+    caps: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @classmethod
@@ -335,6 +339,7 @@ class Surface:
             quality=quality,
             log=(*log, *chosen),
             lattice=flat.lattice * np.sqrt(domain.area / flat.area),
+            caps=None if not mesh.cap_faces else np.arange(len(faces)) >= len(faces) - mesh.cap_faces,
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
@@ -405,6 +410,39 @@ class Surface:
             return vertices, faces
         used, number = topology.renumbered(faces[~filled], len(vertices))
         return vertices[used], number[faces[~filled]]
+
+    @cached_property
+    def part(self) -> Surface:
+        """The surface without caps, in its place and unit; itself, if it has none.
+
+        There a map is measured and drawn; on the closed domain it has a boundary.
+        """
+        if self.caps is None:
+            return self
+        kept = self.of_part
+        number = np.full(len(self.vertices), -1)
+        number[kept] = np.arange(len(kept))
+        source = self.source_vertex[kept]
+        # a vertex on a boundary may have had its first copy at a cap
+        first = np.zeros(len(self.cut_vertex), dtype=np.int64)
+        first[source[::-1]] = np.arange(len(kept))[::-1]
+        present = self.cut_vertex >= 0
+        there = first[self.source_vertex[self.cut_vertex]]
+        return replace(
+            self,
+            vertices=self.vertices[kept],
+            faces=number[self.faces[~self.caps]],
+            uv=self.uv[kept],
+            source_vertex=source,
+            cut_vertex=np.where(present, there, -1),
+            seam_pairs=number[self.seam_pairs[np.isin(self.seam_pairs, kept).all(axis=1)]],
+            caps=None,
+        )
+
+    @cached_property
+    def of_part(self) -> np.ndarray:
+        """The vertices (W,) of :attr:`part`: those of faces that are no caps."""
+        return np.arange(len(self.vertices)) if self.caps is None else np.unique(self.faces[~self.caps])
 
     @property
     def topology(self) -> tuple[int, int]:

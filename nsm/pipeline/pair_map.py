@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytorch_lightning as pl
 import torch
 from rich.console import Console
 from rich.text import Text
@@ -17,6 +18,8 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.configured_surface import configured_repairs
+from nsm.pipeline.parts import closed_parts
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
     neural_surfaces,
@@ -69,6 +72,7 @@ class PairMapTask(Task):
 
     module, data, result, defaults = PairMap, SurfaceData, SurfaceMap, "pair_map"
     closed_domains = True
+    parts_into_wholes = True
     certified = True
     table = staticmethod(pair_table)
     picture_name = "map"
@@ -96,6 +100,8 @@ class PairMapTask(Task):
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
         self.attributes = read_attributes(settings["attributes"], counts)
+        repairs = configured_repairs(self.config)
+        shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
 
@@ -108,7 +114,7 @@ class PairMapTask(Task):
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
-            self.alignments = alignments(phi.surface, psi.surface, common)
+            self.alignments = alignments(phi.surface.part, psi.surface, common)
             self.console.print(isotopy_table(self.alignments[:_CLASSES_SHOWN]))
 
     @property
@@ -138,10 +144,15 @@ class PairMapTask(Task):
             seam=seam,
             start=start,
             mesh=(uv, torch.as_tensor(source.faces)),
+            caps=None if source.caps is None else torch.as_tensor(source.caps),
             diagonal=target.bounding_box_diagonal,
             phi=phi,
             psi=psi,
         )
+
+    def build_data(self) -> pl.LightningDataModule:
+        """Samples of the source, none on caps."""
+        return self.made_data(surface=self.surface.part)
 
     def _for_training(self) -> tuple[torch.nn.Module, torch.nn.Module]:
         """φ and ψ as the training evaluates them."""
@@ -187,7 +198,7 @@ class PairMapTask(Task):
         if number + 1 >= min(_CLASSES_TRIED, len(self.alignments)):
             return False
         result = self.make_result(module)
-        after = mean_log_distortion(self.surface, result.image)
+        after = mean_log_distortion(self.surface.part, result.image[self.surface.of_part])
         missed = float(module.landmark_error().detach().max()) if len(module.points) else 0.0
         following = self.alignments[number + 1]
         wrong = missed > _MISSED or following.distortion < after

@@ -15,6 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from nsm.surfaces import holes, topology
+from nsm.surfaces.caps import capped
 from nsm.surfaces.cutting import first_copies
 from nsm.surfaces.holes import fill
 from nsm.surfaces.loading import as_arrays, check_arrays, error_in
@@ -43,11 +44,14 @@ class Repairs:
             by falling area; None: small ones are removed, and others refused.
         repair: split: the mesh is cut apart at non-manifold edges; None: they are refused.
         fill_holes: the largest number of edges of holes to fill; true: small ones; false: none.
+        closed_area: close all other boundaries by caps, so that the mesh has this area (see
+            :func:`nsm.surfaces.caps.capped`); None: they stay.
     """
 
     parts: Literal["largest"] | int | None = None
     repair: Literal["split"] | None = None
     fill_holes: bool | int = False
+    closed_area: float | None = None
 
 
 NO_DECISION = Repairs()
@@ -61,9 +65,10 @@ class CleanMesh:
         vertices: (V, 3).
         faces: (F, 3).
         source_vertex: (V,) the index of each vertex in the given mesh; -2, -3, ... for those in
-            the middle of filled holes.
+            filled holes, and then those of caps.
         merged: (W,) for each given vertex its index here, or -1 if it was removed.
         log: one line per repair.
+        cap_faces: how many faces, the last ones, are those of caps.
     """
 
     vertices: np.ndarray
@@ -71,6 +76,7 @@ class CleanMesh:
     source_vertex: np.ndarray
     merged: np.ndarray
     log: tuple[str, ...]
+    cap_faces: int = 0
 
 
 def clean(
@@ -119,9 +125,14 @@ def clean(
         old = old[kept]
     merged = first_copies(old, len(vertices))[representative]
     points, split_faces, filled = fill(vertices[old], split_faces, repairs.fill_holes)
-    middles = holes.FIRST - np.arange(len(points) - len(old))
-    source = np.concatenate([old, middles])
-    return CleanMesh(points, split_faces, source, merged, (*log, *filled))
+    part = len(split_faces)
+    if repairs.closed_area is not None:
+        points, split_faces, closed = capped(points, split_faces, repairs.closed_area)
+        filled += closed
+    inserted = holes.FIRST - np.arange(len(points) - len(old))
+    source = np.concatenate([old, inserted])
+    caps = len(split_faces) - part
+    return CleanMesh(points, split_faces, source, merged, (*log, *filled), caps)
 
 
 def _check_size(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
