@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.base import Domain, Keys
+from nsm.domains.caps import without_caps
 from nsm.domains.embedding import GIVEN, check_method
 from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given
 from nsm.domains.names import bounded
@@ -417,32 +418,17 @@ class Surface:
 
         There a map is measured and drawn; on the closed domain it has a boundary.
         """
-        if self.caps is None:
-            return self
-        kept = self.of_part
-        number = np.full(len(self.vertices), -1)
-        number[kept] = np.arange(len(kept))
-        source = self.source_vertex[kept]
-        # a vertex on a boundary may have had its first copy at a cap
-        first = np.zeros(len(self.cut_vertex), dtype=np.int64)
-        first[source[::-1]] = np.arange(len(kept))[::-1]
-        present = self.cut_vertex >= 0
-        there = first[self.source_vertex[self.cut_vertex]]
-        return replace(
-            self,
-            vertices=self.vertices[kept],
-            faces=number[self.faces[~self.caps]],
-            uv=self.uv[kept],
-            source_vertex=source,
-            cut_vertex=np.where(present, there, -1),
-            seam_pairs=number[self.seam_pairs[np.isin(self.seam_pairs, kept).all(axis=1)]],
-            caps=None,
-        )
+        return self if self.caps is None else replace(self, **without_caps(self), caps=None)
 
     @cached_property
     def of_part(self) -> np.ndarray:
         """The vertices (W,) of :attr:`part`: those of faces that are no caps."""
-        return np.arange(len(self.vertices)) if self.caps is None else np.unique(self.faces[~self.caps])
+        every = np.arange(len(self.vertices))
+        return every if self.caps is None else np.unique(self.faces[~self.caps])
+
+    def on_caps(self, face: np.ndarray) -> np.ndarray:
+        """Which of faces (N,) are those of caps: a mask (N,)."""
+        return np.zeros(len(face), dtype=bool) if self.caps is None else self.caps[face]
 
     @property
     def topology(self) -> tuple[int, int]:

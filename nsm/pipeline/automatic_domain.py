@@ -57,12 +57,13 @@ def choose_domain(
         own, topology = _told_by(given, config)
         found = found or own
         topologies += [] if topology is None else [topology]
-    if parts and is_part_of_whole(topologies):
-        topologies = topologies[1:]
+    into = parts and is_part_of_whole(topologies)
+    if into:
+        topologies = topologies[1:]  # the part is closed for the map
     if found is None:
         chosen = made(config.domain).chosen(topologies) if topologies else domain("disc")
         found = chosen if closed and _suits(config, chosen) else domain("disc")
-        if not found.has_boundary:
+        if not found.has_boundary and not into:
             console.print(f"domain={found}: closed surfaces of genus {topologies[0][0]}, no seam")
     config.domain = found.config
     return found

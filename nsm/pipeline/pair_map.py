@@ -223,7 +223,7 @@ class PairMapTask(Task):
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
         if self.trained is not None:
-            before = flipped_percent(self.trained.image_uv, source.faces)
+            before = flipped_percent(self.trained.image_uv[source.of_part], source.part.faces)
             result.metrics["flipped_before_repair_percent"] = before
         first, places = (carried(x, self.start) for x in (source.uv, points))
         result.metrics.update(start_figures(source, target, first, places, targets))
@@ -246,11 +246,13 @@ class PairMapTask(Task):
         return {**said, "isotopy_class": self.config.isotopy_class, "isotopy_classes": classes}
 
     def picture(self, module: Any) -> np.ndarray:
-        return map_image(self.surface, self.psi.surface, evaluate(module, self.surface.uv))
+        part = self.surface.part
+        return map_image(part, self.psi.surface, evaluate(module, part.uv))
 
     def mesh(self, module: Any) -> ColouredMesh:
-        image = self.psi.surface.at(evaluate(module, self.surface.uv))
-        return painted(image, self.surface.faces, self.surface.vertices)
+        part = self.surface.part
+        image = self.psi.surface.at(evaluate(module, part.uv))
+        return painted(image, part.faces, part.vertices)
 
     def save(self, folder: Path, result: SurfaceMap) -> None:
         super().save(folder, result)
@@ -264,8 +266,9 @@ class PairMapTask(Task):
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
         _write_image(folder, f)
+        carried = np.where(f.unreached[:, None], np.nan, f.source_uv)
         meshes = {
-            "target_with_source_uv": (f.target.in_original_units(t.vertices), t, f.source_uv),
+            "target_with_source_uv": (f.target.in_original_units(t.vertices), t, carried),
             "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
         for name, mesh in meshes.items():

@@ -10,17 +10,21 @@ from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
+from rich.text import Text
 
 from nsm.correspondence.coarse_shape import edge_distances
 from nsm.domains import Domain
 from nsm.domains.automatic import is_part_of_whole
 from nsm.domains.joint_preparation import Mesh
+from nsm.pipeline.landmark_inputs import name_of
 from nsm.pipeline.resolve_inputs import Shape
+from nsm.results import NeuralSurface
 from nsm.surfaces.topology import face_areas, genus_and_boundary
 from nsm.surfaces.validation import Repairs
 
 _NEAREST = 3  # landmarks to which distances are compared: long ways may lead around what is missing
 _FEWEST = 3  # landmarks that tell the scale
+_CONES = 4
 
 
 def closed_parts(
@@ -40,36 +44,58 @@ def closed_parts(
         domain: of the map.
         repairs: the decisions on meshes.
         console: where it is said.
+
+    Returns:
+        source and target.
     """
     part, whole = shapes
     if domain.has_boundary or not isinstance(part, Mesh):
-        return list(shapes)
+        return [part, whole]
     mesh = part.cleaned(repairs)
-    if isinstance(whole, Mesh):
-        other = whole.cleaned(repairs)
-        points, faces, theirs = other.vertices, other.faces, other.merged
-    else:
-        surface = whole.surface
-        first, faces = surface.whole()
-        points = whole.in_original_units(surface.vertices[first])
-        theirs = np.searchsorted(surface.source_vertex[first], np.arange(len(surface.cut_vertex)))
+    points, faces, number = _uncut(whole, repairs)
     kinds = [genus_and_boundary(f) for f in (mesh.faces, faces)]
     if not is_part_of_whole(kinds):
-        return list(shapes)
-    there = np.logical_and(*(ids >= 0 for ids in landmarks))
-    marks = np.stack([mesh.merged[landmarks[0][there]], theirs[landmarks[1][there]]])
+        return [part, whole]
+    marks = np.stack([mesh.merged[landmarks[0]], number[landmarks[1]]])
     scale, why = 1.0, "that of the files, for lack of landmarks"
-    if len(marks[0]) >= _FEWEST and (marks >= 0).all():
+    if marks.shape[1] >= _FEWEST and (marks >= 0).all():
         scale = relative_scale((mesh.vertices, mesh.faces), (points, faces), marks)
-        why = "by distances of landmarks"
+        why = "by distances between landmarks"
     console.print(
-        f"{part.name} is open, {whole_name(whole)} is closed: the map takes {part.name} into "
-        f"{whole_name(whole)}; scale {scale:.4g}, {why}",
-        highlight=False,
+        f"{part.name} is open, {name_of(whole)} is closed: {part.name} is mapped into "
+        f"{name_of(whole)}; {_said(scale)}, {why}",
         soft_wrap=True,
     )
+    if marks.shape[1] < _CONES:
+        console.print(
+            Text(
+                f"WARNING: {marks.shape[1]} landmarks of a part do not say where it belongs; give "
+                f"{_CONES} or more",
+                style="yellow",
+            ),
+            soft_wrap=True,
+        )
     area = scale**2 * float(face_areas(points, faces).sum())
     return [replace(part, closed_area=area), whole]
+
+
+def _said(scale: float) -> str:
+    return f"a unit of the target is {scale:.4g} of the source"
+
+
+def _uncut(shape: Shape, repairs: Repairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of a mesh, and its vertex (W,) for each of its file."""
+    if isinstance(shape, NeuralSurface):
+        surface = shape.surface
+        first, faces = surface.whole()
+        number = np.full(int(surface.source_vertex.max()) + 1, -1)
+        number[surface.source_vertex[first]] = np.arange(len(first))
+        file = np.where(
+            surface.cut_vertex >= 0, number[surface.source_vertex[surface.cut_vertex]], -1
+        )
+        return shape.in_original_units(surface.vertices[first]), faces, file
+    mesh = shape.cleaned(repairs)
+    return mesh.vertices, mesh.faces, mesh.merged
 
 
 def relative_scale(
@@ -90,8 +116,3 @@ def relative_scale(
     ratio = np.take_along_axis(ours, near, axis=1) / np.take_along_axis(away, near, axis=1)
     ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
     return float(np.median(ratio)) if len(ratio) else 1.0
-
-
-def whole_name(shape: Shape) -> str:
-    """The name of a surface."""
-    return shape.name if isinstance(shape, Mesh) else shape.surface.name
