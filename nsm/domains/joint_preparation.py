@@ -213,9 +213,10 @@ def check_common_topology(
             if genus == found[0][0] and 0 in (loops, found[0][1]):
                 open_, closed = (name, names[0]) if loops else (names[0], name)
                 raise NsmError(
-                    f"{open_} has a boundary and {closed} has none: maps take whole surfaces to "
-                    f"whole ones, not a part into a whole; close the holes of {open_}, or cut from "
-                    f"{closed} the part that corresponds",
+                    f"{open_} has a boundary and {closed} has none: task=pair_map on "
+                    "domain=orbifold takes an open source of genus 0 into a closed target; other "
+                    f"maps need one topology: close the holes of {open_}, or cut from {closed} the "
+                    "part that corresponds",
                     kind="wrong_topology",
                     key=name,
                 )

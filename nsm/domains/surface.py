@@ -64,8 +64,8 @@ class Surface:
         ends: of open meshes cut together, (1 + J,) int64: a number that is the same for all of
             these, and the vertices of the mesh file at which the cuts end on the boundaries, which
             correspond. None elsewhere.
-        caps: (F,) bool, the faces of caps that close the boundaries of a part for a map into a whole
-            shape (see :meth:`part`); None: there are none.
+        caps: (F,) bool, the faces of caps that close the boundaries of a part for a map into a
+            whole shape (see :attr:`part`); None: there are none.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
             an analytic surface, and for one that an older version stored.
     """
@@ -340,7 +340,7 @@ class Surface:
             quality=quality,
             log=(*log, *chosen),
             lattice=flat.lattice * np.sqrt(domain.area / flat.area),
-            caps=None if not mesh.cap_faces else np.arange(len(faces)) >= len(faces) - mesh.cap_faces,
+            caps=mesh.caps,
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
@@ -418,7 +418,10 @@ class Surface:
 
         There a map is measured and drawn; on the closed domain it has a boundary.
         """
-        return self if self.caps is None else replace(self, **without_caps(self), caps=None)
+        if self.caps is None:
+            return self
+        arrays: dict[str, Any] = without_caps(self)
+        return replace(self, **arrays, caps=None)
 
     @cached_property
     def of_part(self) -> np.ndarray:

@@ -53,6 +53,7 @@ from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.results.pair_pictures import normals_picture
+from nsm.surfaces.topology import face_areas
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
     aligned,
@@ -236,7 +237,15 @@ class PairMapTask(Task):
         return [] if torn is None else [torn]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
-        said = {"target": self.psi.surface.name, "landmarks": len(self.ids[0])}
+        said: dict[str, Any] = {
+            "target": self.psi.surface.name,
+            "landmarks": len(self.ids[0]),
+            "statement": result.statement,  # of the certificate
+        }
+        caps = self.surface.caps
+        if caps is not None:
+            areas = face_areas(self.surface.vertices, self.surface.faces)
+            said["caps_percent"] = 100 * float(areas[caps].sum() / areas.sum())
         if self.domain.has_boundary:
             return said
         classes = [

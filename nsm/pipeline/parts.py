@@ -16,9 +16,8 @@ from nsm.correspondence.coarse_shape import edge_distances
 from nsm.domains import Domain
 from nsm.domains.automatic import is_part_of_whole
 from nsm.domains.joint_preparation import Mesh
-from nsm.pipeline.landmark_inputs import name_of
+from nsm.maps import AnalyticSurface
 from nsm.pipeline.resolve_inputs import Shape
-from nsm.results import NeuralSurface
 from nsm.surfaces.topology import face_areas, genus_and_boundary
 from nsm.surfaces.validation import Repairs
 
@@ -48,22 +47,22 @@ def closed_parts(
     Returns:
         source and target.
     """
-    part, whole = shapes
-    if domain.has_boundary or not isinstance(part, Mesh):
-        return [part, whole]
-    mesh = part.cleaned(repairs)
-    points, faces, number = _uncut(whole, repairs)
-    kinds = [genus_and_boundary(f) for f in (mesh.faces, faces)]
-    if not is_part_of_whole(kinds):
-        return [part, whole]
-    marks = np.stack([mesh.merged[landmarks[0]], number[landmarks[1]]])
+    # the cones of both are chosen together: what was laid out alone is laid out again
+    part, whole = (_mesh(shape) for shape in shapes)
+    if domain.has_boundary or part is None or whole is None:
+        return list(shapes)
+    mesh, other = part.cleaned(repairs), whole.cleaned(repairs)
+    if not is_part_of_whole([genus_and_boundary(m.faces) for m in (mesh, other)]):
+        return list(shapes)
+    points, faces = other.vertices, other.faces
+    marks = np.stack([mesh.merged[landmarks[0]], other.merged[landmarks[1]]])
     scale, why = 1.0, "that of the files, for lack of landmarks"
     if marks.shape[1] >= _FEWEST and (marks >= 0).all():
         scale = relative_scale((mesh.vertices, mesh.faces), (points, faces), marks)
         why = "by distances between landmarks"
     console.print(
-        f"{part.name} is open, {name_of(whole)} is closed: {part.name} is mapped into "
-        f"{name_of(whole)}; {_said(scale)}, {why}",
+        f"{part.name} is open, {whole.name} is closed: {part.name} is mapped into {whole.name}; a "
+        f"unit of the target is {scale:.4g} of the source, {why}",
         soft_wrap=True,
     )
     if marks.shape[1] < _CONES:
@@ -79,23 +78,13 @@ def closed_parts(
     return [replace(part, closed_area=area), whole]
 
 
-def _said(scale: float) -> str:
-    return f"a unit of the target is {scale:.4g} of the source"
-
-
-def _uncut(shape: Shape, repairs: Repairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and faces (F, 3) of a mesh, and its vertex (W,) for each of its file."""
-    if isinstance(shape, NeuralSurface):
-        surface = shape.surface
-        first, faces = surface.whole()
-        number = np.full(int(surface.source_vertex.max()) + 1, -1)
-        number[surface.source_vertex[first]] = np.arange(len(first))
-        file = np.where(
-            surface.cut_vertex >= 0, number[surface.source_vertex[surface.cut_vertex]], -1
-        )
-        return shape.in_original_units(surface.vertices[first]), faces, file
-    mesh = shape.cleaned(repairs)
-    return mesh.vertices, mesh.faces, mesh.merged
+def _mesh(shape: Shape) -> Mesh | None:
+    """The mesh of a shape; None for an analytic one, and for one whose mesh is not known."""
+    if isinstance(shape, Mesh):
+        return shape
+    if isinstance(shape.map, AnalyticSurface) or shape.surface.raw is None:
+        return None
+    return Mesh(shape.surface.name, *shape.surface.raw)
 
 
 def relative_scale(

@@ -56,6 +56,7 @@ def read_file_mesh(path_or_name: str | Path) -> FileMesh:
     vertices, faces, _ = load_mesh(text)
     return FileMesh(text, vertices, faces, read_uv(text))
 
+
 _NOTHING = 204.0  # grey and opaque, where the map takes no point
 
 
@@ -190,13 +191,13 @@ def painted(
 
     def colours(face: np.ndarray, weights: np.ndarray) -> np.ndarray:
         places = here.to_file(f.places(there.to_surface(Places(face, weights)), back=not back))
-        there = places.face >= 0
-        if there.all():
+        known = places.face >= 0
+        if known.all():
             return texture.colours(*places)
-        known = texture.colours(places.face[there], places.weights[there])
-        result = np.full((len(there), known.shape[1]), _NOTHING)
+        some = texture.colours(places.face[known], places.weights[known])
+        result = np.full((len(known), some.shape[1]), _NOTHING)
         result[:, 3:] = 255.0
-        result[there] = known
+        result[known] = some
         return result
 
     return TexturedMesh(end.vertices, end.faces, uv, baked(uv, colours, size), log)

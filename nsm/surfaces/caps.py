@@ -7,8 +7,6 @@ from these. Where a cap crosses the part in space does no harm: a layout sees it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from nsm.surfaces import topology
@@ -79,7 +77,9 @@ def _of_area(loop: np.ndarray, area: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cap(loop: np.ndarray, area: float) -> tuple[np.ndarray, np.ndarray]:
-    """A cap of about an area, as much as a round loop gives it, over a boundary loop (B, 3), in the direction of the mesh's faces.
+    """A cap over a boundary loop (B, 3), in the direction of the mesh's faces.
+
+    It has about the given area; more, if the loop is not round.
 
     Returns:
         its inner vertices (K, 3), and faces of numbers among the loop's vertices and then these.
@@ -88,9 +88,7 @@ def _cap(loop: np.ndarray, area: float) -> tuple[np.ndarray, np.ndarray]:
     length = float(sides.sum())
     middle = loop.mean(axis=0)
     around = 0.5 * np.cross(loop - middle, np.roll(loop, -1, axis=0) - middle).sum(axis=0)
-    radius = max(
-        float(np.sqrt(np.linalg.norm(around) / np.pi)), _NARROW * length / (2 * np.pi)
-    )
+    radius = max(float(np.sqrt(np.linalg.norm(around) / np.pi)), _NARROW * length / (2 * np.pi))
     axes = _axes(around)
     # the loop winds around ``around``; the mesh lies to its left, so that the cap goes down
     height = float(np.sqrt(max(area / np.pi - radius**2, 0.0)))
@@ -151,7 +149,8 @@ class _Profile:
     def steps(self, edge: float, largest: float) -> list[tuple[float, float]]:
         """Where the rings are, and the length of the edges there: from ``edge``, growing."""
         longest = self.length / _FEWEST
-        step, along, found = min(edge, longest), 0.0, []
+        step, along = min(edge, longest), 0.0
+        found: list[tuple[float, float]] = []
         while True:
             along += step
             if along > self.length - 0.75 * step:
@@ -176,7 +175,7 @@ def _circle(angle: np.ndarray, radius: float, height: float) -> np.ndarray:
     )
 
 
-def _between(outer: Sequence[float], inner: Sequence[float], first: int, then: int) -> np.ndarray:
+def _between(outer: np.ndarray, inner: np.ndarray, first: int, then: int) -> np.ndarray:
     """Triangles (N + M, 3) between two rings of vertices at rising angles (N,) and (M,), which
     begin at 0; their numbers begin with ``first`` and ``then``."""
     turn = 2 * np.pi

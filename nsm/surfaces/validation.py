@@ -78,6 +78,12 @@ class CleanMesh:
     log: tuple[str, ...]
     cap_faces: int = 0
 
+    @property
+    def caps(self) -> np.ndarray | None:
+        """Mask (F,) of the faces of caps; None: there are none."""
+        count = len(self.faces)
+        return np.arange(count) >= count - self.cap_faces if self.cap_faces else None
+
 
 def clean(
     vertices: np.ndarray, faces: np.ndarray, name: str = "mesh", repairs: Repairs = NO_DECISION

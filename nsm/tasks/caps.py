@@ -37,9 +37,7 @@ class Caps(nn.Module):
         self.quadrature = MeshQuadrature(uv, faces, surface)
         self.folds = Folds(injectivity)
 
-    def forward(
-        self, h: nn.Module, psi: nn.Module, energy: Any, folding: float, step: int
-    ) -> Tensor:
+    def forward(self, h: Any, psi: Any, energy: Any, folding: float, step: int) -> Tensor:
         """The term: a scalar.
 
         Args:
@@ -58,15 +56,13 @@ class Caps(nn.Module):
         share = some.share
         return (share * (_WEIGHT * values.clamp(min=1e-6).log() + folding * folds)).sum()
 
-    def curvature(
-        self, h: nn.Module, psi: nn.Module, energy: Any, folding: float, step: int
-    ) -> Curvature:
+    def curvature(self, h: Any, psi: Any, energy: Any, folding: float, step: int) -> Curvature:
         """The second derivatives of the term by J_h; arguments as for :meth:`forward`."""
         some = self.quadrature.take(_ALL)
         at = At(some.centres, some.centres_on(some.points))
-        [surface] = self.quadrature._surface
         with torch.no_grad():
-            source = first_fundamental_form(surface.value_and_jacobian(some.centres)[1])
+            phi = self.quadrature.surface
+            source = first_fundamental_form(phi.value_and_jacobian(some.centres)[1])
             image, jacobian = h.value_and_jacobian(some.centres)
             outer = psi.value_and_jacobian(image)[1].double()
 
