@@ -37,6 +37,11 @@ def without_caps(surface: Surface) -> dict[str, np.ndarray]:
     }
 
 
+def on_caps(surface: Surface, face: np.ndarray) -> np.ndarray:
+    """Which of a surface's faces (N,) are those of caps: a mask (N,)."""
+    return np.zeros(len(face), dtype=bool) if surface.caps is None else surface.caps[face]
+
+
 def located_on_part(surface: Surface, points: np.ndarray) -> Places:
     """The nearest places to points (N, 3), in normalised units, on a surface without its caps."""
     if surface.caps is None:

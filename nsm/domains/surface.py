@@ -429,10 +429,6 @@ class Surface:
         every = np.arange(len(self.vertices))
         return every if self.caps is None else np.unique(self.faces[~self.caps])
 
-    def on_caps(self, face: np.ndarray) -> np.ndarray:
-        """Which of faces (N,) are those of caps: a mask (N,)."""
-        return np.zeros(len(face), dtype=bool) if self.caps is None else self.caps[face]
-
     @property
     def topology(self) -> tuple[int, int]:
         """Genus and number of boundary loops of the mesh before it was cut."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nsm.domains import Surface
+from nsm.domains.caps import on_caps
 from nsm.errors import NsmError
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import equal_faces
@@ -69,7 +70,7 @@ class FileFaces:
         """Places on the surface as places on the file's mesh, the nearest ones to filled holes, and
         none on caps."""
         s = self.surface
-        absent = (places.face < 0) | s.on_caps(places.face)
+        absent = (places.face < 0) | on_caps(s, places.face)
         if absent.any():
             return places.where(~absent, self.to_file)
         face = self._file_face[places.face]

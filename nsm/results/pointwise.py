@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.domains import Surface
-from nsm.domains.caps import located_on_part, off_rims
+from nsm.domains.caps import located_on_part, off_rims, on_caps
 from nsm.results.certificate import Correction
 from nsm.results.points import as_points, check_points
 from nsm.surfaces.location import Places
@@ -170,7 +170,7 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
     weights = like(places.weights)
     uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().double().numpy()
     found = off_rims(e, e.domain.locate(uv, reached.detach().cpu().double().numpy(), e.faces))
-    absent, nan = e.on_caps(found.face), torch.tensor(torch.nan, dtype=kind, device=points.device)
+    absent, nan = on_caps(e, found.face), torch.tensor(torch.nan, dtype=kind, device=points.device)
     at, ends = like(found.weights), reached[e.faces[found.face]]
     near = (at[:, :, None] * ends).sum(dim=1).detach()
     begin, finish = like(s.vertices[corners]), like(e.vertices[e.faces[found.face]])

@@ -15,7 +15,7 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 
-from nsm.domains.caps import off_rims
+from nsm.domains.caps import off_rims, on_caps
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface, save_surface
 from nsm.results.certificate import INTO, Correction, certificate, repaired, statement
@@ -103,7 +103,7 @@ class SurfaceMap:
         preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
         found = off_rims(s, s.domain.locate(preimage, s.uv, s.faces))
         points = self.source.in_original_units(found.take(s.vertices, s.faces))
-        points[s.on_caps(found.face)] = np.nan
+        points[on_caps(s, found.face)] = np.nan
         return points
 
     @overload
@@ -253,7 +253,7 @@ class SurfaceMap:
     @cached_property
     def unreached(self) -> np.ndarray:
         """Mask (V,) of the vertices of the cut target to which no point of the source goes."""
-        return self.source.surface.on_caps(self._back.face)
+        return on_caps(self.source.surface, self._back.face)
 
     @cached_property
     def image(self) -> np.ndarray:
