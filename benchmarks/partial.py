@@ -3,8 +3,9 @@
     python benchmarks/partial.py --meshes FOLDER
 
 A piece is what lies on one side of a plane across a principal axis of the shape, or in a geodesic
-ball around its tip, and has a given share of the area; of several parts, the largest. Meshes have
-about 5,000 triangles. All maps are those of ``experiment=fast``, on one thread.
+ball around its tip, and has a given share of the area; of several parts, the largest. Where it is
+mapped into another shape, it is the side, or what is outside the ball, that has more landmarks.
+Meshes have about 5,000 triangles. All maps are those of ``experiment=fast``, on one thread.
 
 - ``itself``: the piece is mapped into the shape that it was cut from, with eight of its vertices as
   landmarks, where the truth is the identity. The error is that of the piece's vertices.
@@ -90,8 +91,12 @@ def shape(meshes: Path, name: str) -> Shape:
     return Shape(mesh.vertices[ids], faces, np.searchsorted(ids, marks))
 
 
-def piece(whole: Shape, cut: str, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices and faces of a piece, and the vertices of the whole that its own are."""
+Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def piece(whole: Shape, cut: str, share: float, marked: bool = False) -> Piece:
+    """Vertices and faces of a piece, and the vertices of the whole that its own are; with
+    ``marked``, the one of both sides that has more landmarks."""
     vertices, faces = whole.vertices, whole.faces
     areas = face_areas(vertices, faces)
     middle = vertices[faces].mean(axis=1)
@@ -105,18 +110,19 @@ def piece(whole: Shape, cut: str, share: float) -> tuple[np.ndarray, np.ndarray,
         axes = np.linalg.eigh((centred.T * areas) @ centred)[1][:, ::-1]
         axis = axes[:, int(cut.split()[1])]
         value = centred @ (axis * np.sign(axis[np.abs(axis).argmax()]))
+    sides = [_side(whole, areas, v, share) for v in ((value, -value) if marked else (value,))]
+    return max(sides, key=lambda side: int(np.isin(whole.landmarks, side[2]).sum()))
+
+
+def _side(whole: Shape, areas: np.ndarray, value: np.ndarray, share: float) -> Piece:
+    """The piece of the faces with the least values (F,)."""
     order = np.argsort(value, kind="stable")
     inside = order[np.cumsum(areas[order]) <= share * areas.sum()]
-    inside = inside[_along_sides(faces[inside])]
-    mesh = clean(vertices, faces[inside], "piece", Repairs("largest"))
+    label = face_components(whole.faces[inside])
+    inside = inside[label == np.bincount(label).argmax()]
+    mesh = clean(whole.vertices, whole.faces[inside], "piece", Repairs("largest"))
     assert boundary_loops(mesh.faces), "the piece is the whole"
     return mesh.vertices, mesh.faces, mesh.source_vertex
-
-
-def _along_sides(faces: np.ndarray) -> np.ndarray:
-    """Mask of the largest of the parts of faces (F, 3)."""
-    label = face_components(faces)
-    return np.asarray(label == np.bincount(label).argmax())
 
 
 def far_apart(vertices: np.ndarray, faces: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
@@ -137,7 +143,7 @@ def errors(target: Shape, images: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def measured(source: Shape, target: Shape, kind: str, cut: str, share: float) -> dict[str, Any]:
     """The figures of one case, and its map."""
-    vertices, faces, number = piece(source, cut, share)
+    vertices, faces, number = piece(source, cut, share, kind == "other")
     if kind == "itself":
         given = far_apart(vertices, faces, np.arange(len(vertices)), GIVEN[kind])
         pairs = np.stack([given, number[given]], axis=1)

@@ -66,6 +66,9 @@ _MORPH_FRAMES = 9
 _CLASSES_SHOWN, _CLASSES_TRIED = 4, 3
 # percent of the diagonal: landmarks that stay so far off are on the wrong side of a twist
 _MISSED = 1.0
+# weight of the largest miss, in units in which the surfaces have the area of Ω, beside the mean
+# logarithm of the distortion, where classes are compared after their training
+_MISS = 3.0
 
 
 class PairMapTask(Task):
@@ -112,6 +115,7 @@ class PairMapTask(Task):
         refuse_other_topology([phi, psi])
         ids = with_ends([phi.surface, psi.surface], ids)
         self.phi, self.psi, self.ids, self.surface = phi, psi, ids, phi.surface
+        self.tried: dict[int, float] = {}
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
@@ -192,26 +196,37 @@ class PairMapTask(Task):
 
     def begin_again(self, module: Any) -> bool:
         """Whether the isotopy class is wrong: landmarks are still missed, or the map is worse than
-        a start in the next class before any training. The next class is then tried."""
+        a start in the next class before any training. The next class is then tried; and in the
+        end the best of those that were tried is taken, which is trained again."""
         if self.domain.has_boundary:
             return False
         number = self.config.isotopy_class
-        if number + 1 >= min(_CLASSES_TRIED, len(self.alignments)):
+        more = number + 1 < min(_CLASSES_TRIED, len(self.alignments))
+        if not more and not self.tried:
             return False
         result = self.make_result(module)
-        after = mean_log_distortion(self.surface.part, result.image[self.surface.of_part])
+        after = mean_log_distortion(self.surface.part, result.part.image)
         missed = float(module.landmark_error().detach().max()) if len(module.points) else 0.0
-        following = self.alignments[number + 1]
-        wrong = missed > _MISSED or following.distortion < after
-        self.console.print(
+        settled = number in self.tried
+        self.tried[number] = after + _MISS * missed / 100 * self.psi.surface.bounding_box_diagonal
+        said = (
             f"isotopy class {number}: mean log distortion {after:.3f}, landmarks missed by "
-            f"{missed:.3g} % of the diagonal at worst; class {number + 1} before its training: "
-            f"{following.distortion:.3f}" + (f"; class {number + 1} is tried" if wrong else ""),
-            soft_wrap=True,
+            f"{missed:.3g} % of the diagonal at worst"
         )
-        if wrong:
-            self.config.isotopy_class = number + 1
-        return wrong
+        following = number
+        if more and not settled:
+            after_it = self.alignments[number + 1].distortion
+            said += f"; class {number + 1} before its training: {after_it:.3f}"
+            if missed > _MISSED or after_it < after:
+                following = number + 1
+                said += f"; class {following} is tried"
+        best = min(self.tried, key=lambda k: self.tried[k])
+        if following == number and best != number and not settled:
+            following = best
+            said += f"; class {best} was better"
+        self.console.print(said, soft_wrap=True)
+        self.config.isotopy_class = following
+        return bool(following != number)
 
     def make_result(self, module: Any) -> SurfaceMap:
         ids = np.stack(self.ids, axis=1)
