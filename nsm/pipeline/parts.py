@@ -68,7 +68,7 @@ def closed_parts(
     if marks.shape[1] < _CONES:
         console.print(
             Text(
-                f"WARNING: {marks.shape[1]} landmarks of a part do not say where it belongs; give "
+                f"WARNING: {marks.shape[1]} landmarks do not say where a part belongs; give "
                 f"{_CONES} or more",
                 style="yellow",
             ),

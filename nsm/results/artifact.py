@@ -264,6 +264,8 @@ def _check_arrays(surface: Surface) -> None:
     caps = surface.caps
     if caps is not None and (caps.shape != (len(surface.faces),) or caps.dtype != np.bool_):
         raise ValueError("caps is no mask of the faces")
+    if caps is not None and caps.all():
+        raise ValueError("caps are all that there is")
     for name, array in surface.arrays().items():
         if name == "caps":
             continue
