@@ -12,18 +12,18 @@ from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import Folds
 from nsm.tasks.mesh_quadrature import MeshQuadrature
 
-# of the logarithm of the distortion, beside the distortion of the part
+# of the logarithm of 1 + the distortion, beside the distortion of the part
 _WEIGHT = 0.01
 _ALL = 65_536
 
 
 class Caps(nn.Module):
-    """A small weight times the mean logarithm of the distortion over the caps' triangles, and how
-    much they fold.
+    """A small weight times the mean logarithm of one plus the distortion over the caps' triangles,
+    and how much they fold.
 
     A cap takes the rest of the target, whatever its shape: its distortion says nothing. Without
-    any term, h could fold there. The logarithm keeps a part that must be stretched much from
-    drawing on the part.
+    any term, h could fold there. By the logarithm, a cap that must be stretched much draws little
+    on the part.
 
     Args:
         uv: (V, 2) vertices of the source in Ω.
@@ -54,7 +54,7 @@ class Caps(nn.Module):
         values = energy.total(energy.parts(some.metric, B, at))
         folds = self.folds(determinant, some.metric, B, step)
         share = some.share
-        return (share * (_WEIGHT * values.clamp(min=1e-6).log() + folding * folds)).sum()
+        return (share * (_WEIGHT * values.clamp(min=0).log1p() + folding * folds)).sum()
 
     def curvature(self, h: Any, psi: Any, energy: Any, folding: float, step: int) -> Curvature:
         """The second derivatives of the term by J_h; arguments as for :meth:`forward`."""
@@ -70,7 +70,7 @@ class Caps(nn.Module):
             target = first_fundamental_form(outer @ j)
             values = energy.total(energy.parts(source, target, at))
             folds = self.folds(torch.linalg.det(j), source, target, step)
-            return _WEIGHT * values.clamp(min=1e-6).log() + folding * folds
+            return _WEIGHT * values.clamp(min=0).log1p() + folding * folds
 
         hessians = some.share.double()[:, None, None] * positive_hessians(term, jacobian)
         return Curvature(h, some.centres, hessians)
