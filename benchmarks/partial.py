@@ -186,8 +186,8 @@ def _area(mesh: Shape) -> float:
     return float(face_areas(mesh.vertices, mesh.faces).sum())
 
 
-def draw(f: Any, whole: Shape) -> None:
-    """The shape that the piece was cut from, the piece, and the target with the piece's colours."""
+def draw(f: Any) -> None:
+    """The piece, coloured by position, and the target with its colours."""
     vertices, faces = f.source.file_mesh()
     points, triangles = f.target.file_mesh()
     colours = by_position(vertices)
@@ -206,16 +206,17 @@ def draw(f: Any, whole: Shape) -> None:
 
 def write(lines: list[dict[str, Any]]) -> None:
     """The JSON and the table of all lines."""
-    result: dict[str, Any] = {"cases": lines}
+    cases = [{k: v for k, v in line.items() if k != "errors"} for line in lines]
+    result: dict[str, Any] = {"cases": cases}
     head = (
         "| piece of | share | boundaries | into | landmarks | mean | within 0.05 | within 0.1 | "
         "symmetric Dirichlet, median | 95th percentile | certified | seconds |"
     )
     rows = [head, "|" + "---|" * 12]
-    for line in lines:
+    for line, case in zip(lines, cases, strict=True):
         off = np.array(line["errors"])
         within = [round(float((off <= s).mean()), 3) for s in SHARES]
-        line.update({f"within {s}": w for s, w in zip(SHARES, within, strict=True)})
+        case.update({f"within {s}": w for s, w in zip(SHARES, within, strict=True)})
         rows.append(
             f"| {line['source']}, {line['cut']} | {line['share']} | {line['loops']} | "
             f"{line['target']} | {line['given']} | {line['mean']} | {within[0]} | {within[1]} | "
@@ -256,8 +257,9 @@ def main() -> None:
             file.write(json.dumps(line) + "\n")
         print({**line, "errors": "..."}, flush=True)
         if (source, target) == PICTURED:
-            draw(f, shapes[source])
+            draw(f)
         write(lines)
+    write(lines)
 
 
 if __name__ == "__main__":
