@@ -14,6 +14,8 @@ import nsm
 from nsm.correspondence.coarse_shape import edge_distances
 from nsm.errors import NsmError
 from nsm.pipeline.parts import relative_scale
+from nsm.results.textures import GREY
+from nsm.results.view.scene import scene_of
 from nsm.surfaces.topology import face_areas
 from nsm.surfaces.validation import Repairs, clean
 
@@ -143,6 +145,16 @@ def test_the_part_is_the_surface_without_caps(made):
     assert np.abs(points - piece[part.source_vertex]).max() < 1e-9
     assert np.array_equal(part.source_vertex[part.cut_vertex], np.arange(len(piece)))
     assert np.array_equal(s.uv[s.of_part], part.uv)
+
+
+def test_the_viewer_shows_the_part_and_leaves_the_rest_grey(made):
+    _, f, (piece, _), _, _ = made
+    scene = scene_of(f)
+    assert len(scene.source.vertices) == len(f.part.image) >= len(piece)
+    assert np.array_equal(scene.unreached, f.unreached) and scene.unreached.any()
+    on_target = scene.paint("position on the source")[1].colours
+    assert (on_target[scene.unreached] == GREY).all()
+    assert (on_target[~scene.unreached] != GREY).any(axis=1).all()
 
 
 def test_the_scale_is_that_of_distances_between_landmarks():
