@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-published bench-closed bench-correspondence bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-published bench-closed bench-correspondence bench-partial bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -50,6 +50,11 @@ bench-closed: .venv/.nsm-dev
 bench-correspondence: .venv/.nsm-dev
 	$(BIN)/python benchmarks/correspondence.py $(if $(MESHES),--meshes $(MESHES)) \
 	  $(if $(EVERY),--every $(EVERY))
+
+# Pieces cut from shapes, mapped into the whole ones and into others: half an hour. It goes on where
+# it stopped. MESHES as above.
+bench-partial: .venv/.nsm-dev
+	$(BIN)/python benchmarks/partial.py $(if $(MESHES),--meshes $(MESHES))
 
 # One network with each activation, its wrinkles, and a report on the runs: half an hour.
 bench-activation: .venv/.nsm-dev

@@ -118,7 +118,8 @@ def map_pair(
     """Map one surface to another with least distortion.
 
     Two closed meshes, given as files, are cut along corresponding paths through their landmarks,
-    which gives the best maps; neural surfaces are taken as they are.
+    which gives the best maps; neural surfaces are taken as they are. An open source of genus 0 is
+    mapped into a closed target, onto the part of it that corresponds; give four landmarks or more.
 
     Args:
         source: a neural surface, the folder of one, a mesh file, a name of the catalogue, an

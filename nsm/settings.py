@@ -477,7 +477,8 @@ class Settings:
     """The settings of a run outside the groups.
 
     Args:
-        source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface.
+        source: of task=pair_map: a mesh file, a catalogue name or the folder of a neural surface;
+            an open one of genus 0 is mapped into a closed target, with four landmarks or more.
         target: the same; or an analytic surface: a name (sphere_cap, plane, ...; sphere with
             domain=orbifold, torus with domain=torus) or '{name: graph, z: 0.3*u*v}'.
         surfaces: of task=collection_map: three surfaces or more, each as source; or a pattern of
@@ -493,7 +494,7 @@ class Settings:
             closed meshes of genus 0: landmarks are proposed, as they are where none are given;
             []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
-            begins: 0 is the likeliest. Where the map turns out wrong, the next is tried.
+            begins: 0 is the likeliest. Where the map turns out wrong, the next ones are tried.
         seams: of task=param: edges along which the mesh is cut, as a list of pairs of vertices or a
             file of them; lines: the l lines of the OBJ file; uv: the borders of the islands of its
             texture coordinates. Several charts are flattened one by one and packed into an atlas.

@@ -185,6 +185,12 @@ def test_tables_hold_what_was_measured(page, heading, files):
     assert shown and shown - measured == set()
 
 
+def test_the_table_of_parts_holds_what_was_measured():
+    text = (ROOT / "docs" / "correspondence.md").read_text(encoding="utf-8")
+    section = text[text.index("## Parts of shapes") : text.index("## Measurements")]
+    assert rows(section) == rows((RESULTS / "partial.md").read_text(encoding="utf-8"))
+
+
 def test_the_table_of_correspondences_holds_what_was_measured():
     text = (ROOT / "docs" / "correspondence.md").read_text(encoding="utf-8")
     section = text[text.index("## Measurements") :]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from nsm.domains.base import Domain
@@ -22,3 +22,12 @@ class Automatic:
         kinds = set(topologies)
         name = _CLOSED.get(next(iter(kinds)), "disc") if len(kinds) == 1 else "disc"
         return DOMAINS[name]
+
+
+def is_part_of_whole(topologies: Sequence[tuple[int, int]]) -> bool:
+    """Whether of two surfaces, by genus and number of boundary loops, the first is open, the second
+    is closed, and both are of genus 0."""
+    if len(topologies) != 2:
+        return False
+    (genus, loops), whole = topologies
+    return genus == 0 and loops > 0 and whole == (0, 0)

@@ -32,12 +32,25 @@ from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh as read: name, vertices (V, 3), faces (F, 3), and the log of reading it."""
+    """A mesh as read: name, vertices (V, 3), faces (F, 3), and the log of reading it.
+
+    ``closed_area`` is that to which a part is closed for a map into a whole shape, as
+    :class:`nsm.surfaces.validation.Repairs` has it.
+    """
 
     name: str
     vertices: np.ndarray
     faces: np.ndarray
     log: tuple[str, ...] = ()
+    closed_area: float | None = None
+
+    def cleaned(self, repairs: Repairs) -> CleanMesh:
+        """The mesh as a clean manifold."""
+        return clean(self.vertices, self.faces, self.name, self.decided(repairs))
+
+    def decided(self, repairs: Repairs) -> Repairs:
+        """The decisions on all meshes, and that to close this one."""
+        return replace(repairs, closed_area=self.closed_area)
 
 
 def prepare_jointly(
@@ -83,7 +96,7 @@ def prepare_jointly(
             kind="unknown_option",
             key="surface.parameterization",
         )
-    cleaned = [clean(m.vertices, m.faces, m.name, repairs) for m in meshes]
+    cleaned = [m.cleaned(repairs) for m in meshes]
     found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
     everywhere: np.ndarray = np.all(np.stack(found) >= 0, axis=0)
     common_ids = [ids[everywhere] for ids in found]
@@ -109,7 +122,7 @@ def prepare_jointly(
                 parameterization=parameterization,
                 cache=cache,
                 log=m.log,
-                repairs=repairs,
+                repairs=m.decided(repairs),
             )
 
         return _laid_out(alone, list(zip(meshes)), processes)
@@ -200,9 +213,10 @@ def check_common_topology(
             if genus == found[0][0] and 0 in (loops, found[0][1]):
                 open_, closed = (name, names[0]) if loops else (names[0], name)
                 raise NsmError(
-                    f"{open_} has a boundary and {closed} has none: maps take whole surfaces to "
-                    f"whole ones, not a part into a whole; close the holes of {open_}, or cut from "
-                    f"{closed} the part that corresponds",
+                    f"{open_} has a boundary and {closed} has none: task=pair_map on "
+                    "domain=orbifold takes an open source of genus 0 into a closed target; other "
+                    f"maps need one topology: close the holes of {open_}, or cut from {closed} the "
+                    "part that corresponds",
                     kind="wrong_topology",
                     key=name,
                 )

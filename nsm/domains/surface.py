@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.base import Domain, Keys
+from nsm.domains.caps import without_caps
 from nsm.domains.embedding import GIVEN, check_method
 from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given
 from nsm.domains.names import bounded
@@ -32,7 +34,7 @@ from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
-OPTIONAL = ("lattice", "ends")
+OPTIONAL = ("lattice", "ends", "caps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,8 @@ class Surface:
         ends: of open meshes cut together, (1 + J,) int64: a number that is the same for all of
             these, and the vertices of the mesh file at which the cuts end on the boundaries, which
             correspond. None elsewhere.
+        caps: (F,) bool, the faces of caps that close the boundaries of a part for a map into a
+            whole shape (see :attr:`part`); None: there are none.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
             an analytic surface, and for one that an older version stored.
     """
@@ -80,6 +84,7 @@ class Surface:
     log: tuple[str, ...] = field(default=(), repr=False)
     lattice: np.ndarray | None = field(default=None, repr=False)
     ends: np.ndarray | None = field(default=None, repr=False)
+    caps: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @classmethod
@@ -335,6 +340,7 @@ class Surface:
             quality=quality,
             log=(*log, *chosen),
             lattice=flat.lattice * np.sqrt(domain.area / flat.area),
+            caps=mesh.caps,
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
@@ -405,6 +411,23 @@ class Surface:
             return vertices, faces
         used, number = topology.renumbered(faces[~filled], len(vertices))
         return vertices[used], number[faces[~filled]]
+
+    @cached_property
+    def part(self) -> Surface:
+        """The surface without caps, in its place and unit; itself, if it has none.
+
+        There a map is measured and drawn; on the closed domain it has a boundary.
+        """
+        if self.caps is None:
+            return self
+        arrays: dict[str, Any] = without_caps(self)
+        return replace(self, **arrays, caps=None)
+
+    @cached_property
+    def of_part(self) -> np.ndarray:
+        """The vertices (W,) of :attr:`part`: those of faces that are no caps."""
+        every = np.arange(len(self.vertices))
+        return every if self.caps is None else np.unique(self.faces[~self.caps])
 
     @property
     def topology(self) -> tuple[int, int]:

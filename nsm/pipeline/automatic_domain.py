@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Automatic, Domain, Surface, domain
+from nsm.domains.automatic import is_part_of_whole
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, build_analytic
@@ -27,7 +28,12 @@ def is_automatic(config: Any) -> bool:
 
 
 def choose_domain(
-    config: DictConfig, inputs: Iterable[Any], console: Console, *, closed: bool
+    config: DictConfig,
+    inputs: Iterable[Any],
+    console: Console,
+    *,
+    closed: bool,
+    parts: bool = False,
 ) -> Domain:
     """The domain that suits a run, which takes the place of ``auto`` in its settings.
 
@@ -40,6 +46,7 @@ def choose_domain(
             :func:`nsm.pipeline.resolve_inputs.read_shape` takes them.
         console: where the choice is told.
         closed: whether the task can do without a boundary.
+        parts: whether it takes the first input, a part, into the second, a whole shape.
 
     Raises:
         NsmError: a mesh that cannot be read.
@@ -50,10 +57,13 @@ def choose_domain(
         own, topology = _told_by(given, config)
         found = found or own
         topologies += [] if topology is None else [topology]
+    into = parts and is_part_of_whole(topologies)
+    if into:
+        topologies = topologies[1:]  # the part is closed for the map
     if found is None:
         chosen = made(config.domain).chosen(topologies) if topologies else domain("disc")
         found = chosen if closed and _suits(config, chosen) else domain("disc")
-        if not found.has_boundary:
+        if not found.has_boundary and not into:
             console.print(f"domain={found}: closed surfaces of genus {topologies[0][0]}, no seam")
     config.domain = found.config
     return found

@@ -20,6 +20,7 @@ from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.pipeline.landmark_places import as_places, with_places
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.landmark_files import to_json
+from nsm.surfaces.topology import boundary_loops
 from nsm.surfaces.validation import CleanMesh, clean
 
 AUTO = "auto"
@@ -159,6 +160,8 @@ def given_or_proposed(
         return list(shapes), ids, None
     repairs = configured_repairs(config)
     cleaned = [clean(mesh.vertices, mesh.faces, mesh.name, repairs) for mesh in meshes]
+    if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
+        return list(shapes), ids, None
     if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):
         return list(shapes), ids, None  # refused where the meshes are prepared
     try:

@@ -69,6 +69,7 @@ class Task:
         defaults: the option of the group ``task`` with the default configuration.
         certified: the result is checked for injectivity and repaired.
         closed_domains: it works on domains without boundary too.
+        parts_into_wholes: it maps an open source into a closed target.
         table: from the figures to a table to print, or None.
         picture_name: of the pictures in the log.
         config: of the run.
@@ -85,6 +86,7 @@ class Task:
     defaults: ClassVar[str]
     certified: ClassVar[bool] = False
     closed_domains: ClassVar[bool] = False
+    parts_into_wholes: ClassVar[bool] = False
     table: ClassVar[Callable[..., Any] | None] = None
     picture_name: ClassVar[str] = "surface"
     config: DictConfig
@@ -141,8 +143,8 @@ class Task:
             NsmError: an input that cannot be used.
         """
         if is_automatic(self.config.domain):
-            closed = self.closed_domains
-            choose_domain(self.config, self.inputs(given), self.console, closed=closed)
+            how = {"closed": self.closed_domains, "parts": self.parts_into_wholes}
+            choose_domain(self.config, self.inputs(given), self.console, **how)
             self.setup(self.config, self.console)
 
     def prepare(self, given: Given) -> None:

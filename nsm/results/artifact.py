@@ -261,7 +261,14 @@ def _check_arrays(surface: Surface) -> None:
     for name, shape in expected.items():
         if getattr(surface, name).shape != shape:
             raise ValueError(f"{name} is not {shape}")
+    caps = surface.caps
+    if caps is not None and (caps.shape != (len(surface.faces),) or caps.dtype != np.bool_):
+        raise ValueError("caps is no mask of the faces")
+    if caps is not None and caps.all():
+        raise ValueError("caps are all that there is")
     for name, array in surface.arrays().items():
+        if name == "caps":
+            continue
         whole = name in ("faces", "source_vertex", "cut_vertex", "seam_pairs", "ends")
         if array.dtype != (np.int64 if whole else np.float64):
             raise ValueError(f"{name} has another type")

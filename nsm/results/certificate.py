@@ -20,6 +20,8 @@ from nsm.domains.planar_mesh import boundary_self_intersections, flipped
 from nsm.domains.untangling import untangled
 from nsm.surfaces.topology import boundary_loops
 
+INTO = "injective into the target"  # of a part of a shape
+
 
 def certificate(
     domain: Domain | None,

@@ -132,18 +132,29 @@ def transferred(f: SurfaceMap | ComposedMap, values: np.ndarray, back: bool) -> 
     places = f.correspondences(back=not back)
     if np.issubdtype(values.dtype, np.integer) or values.dtype == bool:
         best = places.weights.argmax(axis=1)
-        return values[faces[places.face, best]]
+        return _labelled(values[faces[places.face, best]], places.face < 0)
     return places.take(values, faces)
+
+
+def _labelled(values: np.ndarray, absent: np.ndarray) -> np.ndarray:
+    """Labels (W, ...) with -1, or False, in the rows of a mask (W,)."""
+    if not absent.any():
+        return values
+    if values.dtype.kind == "u":
+        values = values.astype(np.int64)
+    values[absent] = False if values.dtype == bool else -1
+    return values
 
 
 def correspondence_matrix(f: SurfaceMap | ComposedMap) -> csr_matrix:
     """The matrix (W, V) that interpolates values at the source's vertices at the points that the
     target's correspond to."""
     face, weights = f.correspondences(back=True)
-    columns = f.source.file_mesh()[1][face]
-    rows = np.repeat(np.arange(len(face)), 3)
+    there = np.flatnonzero(face >= 0)
+    columns = f.source.file_mesh()[1][face[there]]
+    rows = np.repeat(there, 3)
     shape = (len(face), len(f.source.surface.cut_vertex))
-    return csr_matrix((weights.ravel(), (rows, columns.ravel())), shape=shape)
+    return csr_matrix((weights[there].ravel(), (rows, columns.ravel())), shape=shape)
 
 
 def write_correspondences(path: str | Path, f: SurfaceMap | ComposedMap) -> None:
@@ -152,7 +163,8 @@ def write_correspondences(path: str | Path, f: SurfaceMap | ComposedMap) -> None
     ``source_to_target_vertices`` (W, 3) are the vertices of the target's file at the corners of the
     face ``source_to_target_face`` (W,) that each vertex of the source's file goes to, and
     ``source_to_target_barycentric`` (W, 3) their weights; ``target_to_source_...`` the same for
-    each vertex of the target's file.
+    each vertex of the target's file. Of a source that is a part, vertices of the target without a
+    preimage have -1 and NaN there.
 
     Raises:
         OSError: the folder cannot be written.
@@ -164,7 +176,7 @@ def write_correspondences(path: str | Path, f: SurfaceMap | ComposedMap) -> None
     ):
         face, weights = f.correspondences(back=back)
         arrays[f"{name}_face"] = face
-        arrays[f"{name}_vertices"] = end.file_mesh()[1][face]
+        arrays[f"{name}_vertices"] = np.where(face[:, None] < 0, -1, end.file_mesh()[1][face])
         arrays[f"{name}_barycentric"] = weights
     data = io.BytesIO()
     np.savez_compressed(data, **arrays)

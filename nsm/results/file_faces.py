@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nsm.domains import Surface
+from nsm.domains.caps import on_caps
 from nsm.errors import NsmError
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import equal_faces
@@ -66,8 +67,12 @@ class FileFaces:
         )
 
     def to_file(self, places: Places) -> Places:
-        """Places on the surface as places on the file's mesh, the nearest ones to filled holes."""
+        """Places on the surface as places on the file's mesh, the nearest ones to filled holes, and
+        none on caps."""
         s = self.surface
+        absent = (places.face < 0) | on_caps(s, places.face)
+        if absent.any():
+            return places.where(~absent, self.to_file)
         face = self._file_face[places.face]
         weights = np.zeros_like(places.weights)
         np.put_along_axis(weights, self._corner[places.face], places.weights, axis=1)
@@ -83,6 +88,9 @@ class FileFaces:
 
     def to_surface(self, places: Places) -> Places:
         """Places on the file's mesh as places on the surface, the nearest ones to removed faces."""
+        absent = places.face < 0
+        if absent.any():
+            return places.where(~absent, self.to_surface)
         face = self._surface_face[places.face]
         weights = np.take_along_axis(places.weights, self._corner[face], axis=1)
         lost = np.flatnonzero(face < 0)

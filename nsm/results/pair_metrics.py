@@ -83,7 +83,7 @@ def pair_metrics(
     landmark_image: np.ndarray,
     landmark_target: np.ndarray,
 ) -> dict[str, float]:
-    """The figures of METHOD's "How quality is measured", maps.
+    """The figures of METHOD's "How quality is measured", maps; of a part, without its caps.
 
     Args:
         source, target: the surfaces.
@@ -100,10 +100,11 @@ def pair_metrics(
         the distance on the target between the images of two seam vertices that were one point, of
         the diagonal.
     """
-    image = target.at(image_uv)
+    part, own = source.part, image_uv[source.of_part]
+    image = target.at(own)
     to_percent = 100 / target.bounding_box_diagonal
-    figures = distortion_figures(source.vertices, image, source.faces)
-    figures["flipped_percent"] = flipped_percent(image_uv, source.faces)
+    figures = distortion_figures(part.vertices, image, part.faces)
+    figures["flipped_percent"] = flipped_percent(own, part.faces)
     distances = {"landmark_error": _missed(target, landmark_image, landmark_target)}
     if source.domain.has_boundary:
         distance = bounded(source.domain).signed_distance(torch.from_numpy(image_uv)).numpy()
@@ -137,8 +138,9 @@ def start_figures(
         symmetric_dirichlet_median, _mean and _p95; singular_value_ratio_median; flipped_percent;
         landmark_error_max_percent, if there are landmarks: each after ``start_``.
     """
-    figures = distortion_figures(source.vertices, target.at(image_uv), source.faces)
-    figures["flipped_percent"] = flipped_percent(image_uv, source.faces)
+    part, own = source.part, image_uv[source.of_part]
+    figures = distortion_figures(part.vertices, target.at(own), part.faces)
+    figures["flipped_percent"] = flipped_percent(own, part.faces)
     if len(landmark_image):
         off = _missed(target, landmark_image, landmark_target)
         figures["landmark_error_max_percent"] = (
@@ -160,5 +162,7 @@ def _covered_percent(source: Surface, target: Surface, image_uv: np.ndarray) -> 
     weights = random.dirichlet(np.ones(3), size=_COVER_SAMPLES)
     uv = (weights[:, :, None] * target.uv[target.faces[face]]).sum(axis=1)
     domain = source.domain
+    if source.caps is not None:
+        return 100 * float((~source.caps[domain.locate(uv, image_uv, source.faces).face]).mean())
     nearest = domain.carried(uv, image_uv, image_uv, source.faces, source.seam_pairs)
     return 100 * float((np.linalg.norm(nearest - uv, axis=1) <= ON_BOUNDARY).mean())

@@ -21,6 +21,7 @@ from nsm.results.pictures import PANEL, by_normals, checked, panels, save_figure
 from nsm.results.render import Blend, View, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.results.surface_map import SurfaceMap
+from nsm.results.textures import GREY
 
 _STRIP, _GIF = 300, 300
 _LEAST, _WORST = LEAST_SYMMETRIC_DIRICHLET, 20.0  # ends of the colour scale
@@ -34,10 +35,11 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     The target is drawn with its own triangles, aligned with the source. Landmarks are spheres, of
     one colour for the two of a pair.
     """
-    s, t = f.source.surface, f.target.surface
+    s, t = f.part.source.surface, f.target.surface
     target = f.aligned(t.vertices)
     colours = by_position(s.vertices)
-    carried = f._back.take(colours, s.faces)
+    carried = _on_target(f, colours)
+    board = np.where(f.unreached[:, None], np.nan, f.source_uv)
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
 
     def at_source(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
@@ -51,7 +53,7 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     rows = [
         [
             (at_source(checked(s.uv)), f"{s.name}: checkerboard"),
-            (at_target(checked(f.source_uv)), f"transferred to {t.name}"),
+            (at_target(checked(board)), f"transferred to {t.name}"),
         ],
         [
             (at_source(lambda blend: blend(colours)), "colours of position"),
@@ -64,10 +66,10 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
 def normals_picture(path: str | Path, f: SurfaceMap) -> None:
     """The source coloured by its normals, and these colours transferred to the target, such as an
     analytic surface: features that its shape does not have show where the source's come to lie."""
-    s, t = f.source.surface, f.target.surface
+    s, t = f.part.source.surface, f.target.surface
     normals = vertex_normals(s.vertices, s.faces, s.seam_pairs)
     left, right = View(s.vertices, PANEL), View(t.vertices, PANEL)
-    carried = f._back.take(normals, s.faces)
+    carried = _on_target(f, normals)
     panel = [
         (left.draw(s.vertices, s.faces, by_normals(normals), s.seam_pairs), f"{s.name}: normals"),
         (
@@ -78,8 +80,21 @@ def normals_picture(path: str | Path, f: SurfaceMap) -> None:
     save_figure(panels(panel), path)
 
 
+def _on_target(f: SurfaceMap, values: np.ndarray) -> np.ndarray:
+    """Values (V, ...) at the vertices of the source without caps, at the target's vertices; grey
+    where there is none."""
+    s = f.source.surface
+    every = np.empty((len(s.vertices), *values.shape[1:]))
+    every[:] = GREY
+    every[s.of_part] = values
+    carried = f._back.take(every, s.faces)
+    carried[f.unreached] = GREY
+    return carried
+
+
 def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     """Symmetric Dirichlet on the source and on its image, with its histogram."""
+    f = f.part
     s = f.source.surface
     value = _energy(s, f.image)
     scale, colours = _SCALE, _coloured(s, value)
@@ -137,6 +152,7 @@ def _coloured(surface: Surface, value: np.ndarray) -> np.ndarray:
 
 def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> None:
     """The morph from source to target: five pictures in a row, and a GIF, back and forth."""
+    f = f.part
     s = f.source.surface
     start, end = s.vertices, f.aligned_image
     both = np.concatenate([start, end])

@@ -21,13 +21,12 @@ from nsm.results.files import atomic_write
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.metrics import vertex_error
 from nsm.results.render import Blend, View, vertex_normals
-from nsm.results.textures import checkerboard_at
+from nsm.results.textures import GREY, checkerboard_at
 from nsm.surfaces.geometry import subdivide
 
 if TYPE_CHECKING:
     from nsm.results.artifact import NeuralSurface
 
-GREY = np.array([0.80, 0.82, 0.85])
 PANEL = 640
 # at least as many triangles show the shape of φ rather than that of the mesh
 _FINE_FACES = 30_000

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from nsm.domains import Surface
+from nsm.domains.caps import located_on_part, off_rims, on_caps
 from nsm.results.certificate import Correction
 from nsm.results.points import as_points, check_points
-from nsm.surfaces.location import Places, locate
+from nsm.surfaces.location import Places
 
 if TYPE_CHECKING:
     from nsm.results.surface_map import SurfaceMap
@@ -126,7 +127,8 @@ def moved(f: SurfaceMap, points: Tensor, image: Image, *, back: bool = False) ->
         back: by the inverse.
 
     Returns:
-        (N, 3) in the type of the points, on their device.
+        (N, 3) in the type of the points, on their device; NaN where no point of a source that is a
+        part goes.
 
     Raises:
         NsmError: ``wrong_shape`` or ``not_finite``.
@@ -167,7 +169,8 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
         reached = like(e.uv)
     weights = like(places.weights)
     uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().double().numpy()
-    found = e.domain.locate(uv, reached.detach().cpu().double().numpy(), e.faces)
+    found = off_rims(e, e.domain.locate(uv, reached.detach().cpu().double().numpy(), e.faces))
+    absent, nan = on_caps(e, found.face), torch.tensor(torch.nan, dtype=kind, device=points.device)
     at, ends = like(found.weights), reached[e.faces[found.face]]
     near = (at[:, :, None] * ends).sum(dim=1).detach()
     begin, finish = like(s.vertices[corners]), like(e.vertices[e.faces[found.face]])
@@ -177,13 +180,15 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
         uv = (_barycentric(p, begin, weights)[:, :, None] * laid_out).sum(dim=1)
         inside = _barycentric(e.domain.lift(uv, near), ends, at)
         result = (inside[:, :, None] * finish).sum(dim=1)
+        if absent.any():
+            result = torch.where(torch.from_numpy(absent)[:, None].to(result.device), nan, result)
         return (result / e.scale + like(e.center)).to(given.dtype)
 
     return through
 
 
 def located(surface: Surface, points: np.ndarray, name: str) -> Places:
-    """Where points (N, 3), in the units of its file, are on a surface's mesh.
+    """Where points (N, 3), in the units of its file, are on a surface's mesh, not on its caps.
 
     Raises:
         NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
@@ -191,7 +196,7 @@ def located(surface: Surface, points: np.ndarray, name: str) -> Places:
     points = as_points(points, 3, name)
     with np.errstate(over="ignore"):  # of points far away
         normalised = (points - surface.center) * surface.scale
-    return locate(normalised, surface.vertices, surface.faces)
+    return located_on_part(surface, normalised)
 
 
 def _barycentric(points: Tensor, corners: Tensor, value: Tensor) -> Tensor:

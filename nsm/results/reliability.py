@@ -124,7 +124,7 @@ def write_reliability(path: str | Path, f: SurfaceMap) -> None:
 
 def reliability_picture(path: str | Path, f: SurfaceMap) -> None:
     """The source three times, coloured by each of the figures."""
-    s = f.source.surface
+    s = f.part.source.surface
     colours = _colours(f.reliability)
     # a point inserted between vertices takes the colour of one of them
     row = np.maximum(s.source_vertex, 0)

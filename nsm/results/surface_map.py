@@ -15,9 +15,10 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 
+from nsm.domains.caps import off_rims, on_caps
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface, save_surface
-from nsm.results.certificate import Correction, certificate, repaired, statement
+from nsm.results.certificate import INTO, Correction, certificate, repaired, statement
 from nsm.results.composed_map import ComposedMap, composed, correspondence_matrix, transferred
 from nsm.results.file_faces import FileFaces
 from nsm.results.files import write_pair
@@ -89,7 +90,8 @@ class SurfaceMap:
     def inverse(self, points: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 3) anywhere on the target to those (N, 3) of the source that f sends there.
 
-        Points off the target start from the nearest point on it. Tensors as for :meth:`__call__`.
+        Points off the target start from the nearest point on it. Where f sends no point of the
+        source, a part, the result is NaN. Tensors as for :meth:`__call__`.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
@@ -99,7 +101,10 @@ class SurfaceMap:
         s, t = self.source.surface, self.target.surface
         uv = located(t, points, "points on the target").take(t.uv, t.faces)
         preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
-        return self.source.in_original_units(s.at(preimage))
+        found = off_rims(s, s.domain.locate(preimage, s.uv, s.faces))
+        points = self.source.in_original_units(found.take(s.vertices, s.faces))
+        points[on_caps(s, found.face)] = np.nan
+        return points
 
     @overload
     def value_and_jacobian(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
@@ -156,7 +161,8 @@ class SurfaceMap:
 
         Returns:
             face (W,), the rows of ``target.file_mesh()``'s faces, and barycentric coordinates
-            (W, 3) in them: ``face, weights = f.correspondences()``.
+            (W, 3) in them: ``face, weights = f.correspondences()``. With ``back``, a vertex of the
+            target to which no point of the source, a part, goes has the face -1 and NaN.
         """
         return self._corresponding_back if back else self._corresponding
 
@@ -215,8 +221,13 @@ class SurfaceMap:
 
     @property
     def statement(self) -> str:
-        """What the certificate says, if it holds."""
+        """What the certificate says, if it holds.
+
+        Of a part, closed by caps, all of it is certified, and so is the part within.
+        """
         s = self.source.surface
+        if s.caps is not None:
+            return INTO
         return statement(s.domain, seam=len(s.seam_pairs) > 0)
 
     def repaired(self) -> SurfaceMap:
@@ -227,6 +238,22 @@ class SurfaceMap:
         better = repaired(s.domain, s.uv, s.faces, self.image_uv, held, s.seam_pairs)
         correction = Correction.between(self.image_uv, better, self.correction)
         return replace(self, correction=correction, vertex_image=self._uncorrected)
+
+    @cached_property
+    def part(self) -> SurfaceMap:
+        """The map of the source without caps, as it is measured and drawn; itself, if the source
+        has none."""
+        s = self.source.surface
+        if s.caps is None:
+            return self
+        image = self.image_uv[s.of_part]
+        source = replace(self.source, surface=s.part)
+        return replace(self, source=source, vertex_image=image, correction=Correction())
+
+    @cached_property
+    def unreached(self) -> np.ndarray:
+        """Mask (V,) of the vertices of the cut target to which no point of the source goes."""
+        return on_caps(self.source.surface, self._back.face)
 
     @cached_property
     def image(self) -> np.ndarray:
@@ -241,8 +268,11 @@ class SurfaceMap:
                 ``target.surface`` with ``back``.
         """
         s, t = self.source.surface, self.target.surface
+        absent = given.face < 0
+        if absent.any():
+            return given.where(~absent, lambda there: self.places(there, back=back))
         if back:
-            return s.domain.locate(given.take(t.uv, t.faces), self.image_uv, s.faces)
+            return off_rims(s, s.domain.locate(given.take(t.uv, t.faces), self.image_uv, s.faces))
         return t.domain.locate(given.take(self.image_uv, s.faces), t.uv, t.faces)
 
     @cached_property
@@ -268,11 +298,14 @@ class SurfaceMap:
     @cached_property
     def _back(self) -> Places:
         s, t = self.source.surface, self.target.surface
-        return s.domain.locate(t.uv, self.image_uv, s.faces)
+        return off_rims(s, s.domain.locate(t.uv, self.image_uv, s.faces))
 
     @cached_property
     def source_uv(self) -> np.ndarray:
-        """h⁻¹ at the target's vertices (of the cut mesh): (V, 2) in the source's domain."""
+        """h⁻¹ at the target's vertices (of the cut mesh): (V, 2) in the source's domain.
+
+        At those that are :attr:`unreached` too, where h⁻¹ is that of the closed source.
+        """
         s, t = self.source.surface, self.target.surface
         return s.domain.carried(t.uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
 
@@ -286,7 +319,8 @@ class SurfaceMap:
 
         Returns:
             (W, ...) a row for each vertex of the other mesh file, interpolated where
-            :meth:`correspondences` says.
+            :meth:`correspondences` says. Vertices of the target to which no point of the source, a
+            part, goes have NaN; of labels -1, and of truth values False.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
@@ -324,7 +358,8 @@ class SurfaceMap:
         """The matrix (W, V) that :meth:`transfer` applies to values at the source's vertices.
 
         Rows belong to vertices of the target's mesh file, columns to those of the source's. Rows
-        have a sum of one and no negative entries.
+        have a sum of one and no negative entries; they are zero for vertices to which no point of
+        the source, a part, goes.
         """
         return correspondence_matrix(self)
 
@@ -373,7 +408,7 @@ class SurfaceMap:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
         points = as_points(points, 3, "points near the target")
-        image, reference = self.image, self.source.surface.vertices
+        image, reference = self.part.image, self.part.source.surface.vertices
         p, q = image.mean(axis=0), reference.mean(axis=0)
         u, _, vt = np.linalg.svd((image - p).T @ (reference - q))
         flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

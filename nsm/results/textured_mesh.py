@@ -57,6 +57,9 @@ def read_file_mesh(path_or_name: str | Path) -> FileMesh:
     return FileMesh(text, vertices, faces, read_uv(text))
 
 
+_NOTHING = 204.0  # grey and opaque, where the map takes no point
+
+
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
     """A mesh with one image.
@@ -188,7 +191,14 @@ def painted(
 
     def colours(face: np.ndarray, weights: np.ndarray) -> np.ndarray:
         places = here.to_file(f.places(there.to_surface(Places(face, weights)), back=not back))
-        return texture.colours(*places)
+        known = places.face >= 0
+        if known.all():
+            return texture.colours(*places)
+        some = texture.colours(places.face[known], places.weights[known])
+        result = np.full((len(known), some.shape[1]), _NOTHING)
+        result[:, 3:] = 255.0
+        result[known] = some
+        return result
 
     return TexturedMesh(end.vertices, end.faces, uv, baked(uv, colours, size), log)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,17 +15,24 @@ class Places(NamedTuple):
     """Points on a mesh.
 
     Attributes:
-        face: (N,) the face of each point.
-        weights: (N, 3) its barycentric coordinates in that face.
+        face: (N,) the face of each point; -1 where there is none.
+        weights: (N, 3) its barycentric coordinates in that face; NaN where there is none.
     """
 
     face: np.ndarray
     weights: np.ndarray
 
     def take(self, values: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Values (V, ...) at the vertices, interpolated at the points: (N, ...)."""
+        """Values (V, ...) at the vertices, interpolated at the points: (N, ...); NaN where there is
+        none."""
         corners = values[faces[self.face]]
         return np.einsum("nk,nk...->n...", self.weights, corners)
+
+    def where(self, mask: np.ndarray, function: Callable[[Places], Places]) -> Places:
+        """What a function makes of the places of a mask (N,); none for the others."""
+        face, weights = np.full(len(mask), -1), np.full((len(mask), 3), np.nan)
+        face[mask], weights[mask] = function(Places(self.face[mask], self.weights[mask]))
+        return Places(face, weights)
 
 
 def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Places:

@@ -15,7 +15,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from nsm.surfaces import holes, topology
+from nsm.surfaces.caps import capped
 from nsm.surfaces.cutting import first_copies
+from nsm.surfaces.degenerate import distinct_corners, first_uses, without_degenerate
 from nsm.surfaces.holes import fill
 from nsm.surfaces.loading import as_arrays, check_arrays, error_in
 
@@ -24,9 +26,6 @@ from nsm.surfaces.loading import as_arrays, check_arrays, error_in
 # choose a component.
 DROPPED_SHARE = 0.05
 DROPPED_TOTAL = 0.10
-# A triangle is degenerate if its height over its longest side is below twice this share of the
-# bounding box's diagonal, about the precision of its coordinates. Small triangles are not.
-DEGENERATE_HEIGHT = 1e-14
 # Neighbours closer than this share of the diagonal are duplicates of one vertex.
 COINCIDENT = 1e-13
 # Bounds on coordinates and on the size of the bounding box, in the file's unit: single precision,
@@ -43,11 +42,14 @@ class Repairs:
             by falling area; None: small ones are removed, and others refused.
         repair: split: the mesh is cut apart at non-manifold edges; None: they are refused.
         fill_holes: the largest number of edges of holes to fill; true: small ones; false: none.
+        closed_area: close all other boundaries by caps, so that the mesh has this area (see
+            :func:`nsm.surfaces.caps.capped`); None: they stay.
     """
 
     parts: Literal["largest"] | int | None = None
     repair: Literal["split"] | None = None
     fill_holes: bool | int = False
+    closed_area: float | None = None
 
 
 NO_DECISION = Repairs()
@@ -61,9 +63,10 @@ class CleanMesh:
         vertices: (V, 3).
         faces: (F, 3).
         source_vertex: (V,) the index of each vertex in the given mesh; -2, -3, ... for those in
-            the middle of filled holes.
+            filled holes, and then those of caps.
         merged: (W,) for each given vertex its index here, or -1 if it was removed.
         log: one line per repair.
+        cap_faces: how many faces, the last ones, are those of caps.
     """
 
     vertices: np.ndarray
@@ -71,6 +74,13 @@ class CleanMesh:
     source_vertex: np.ndarray
     merged: np.ndarray
     log: tuple[str, ...]
+    cap_faces: int = 0
+
+    @property
+    def caps(self) -> np.ndarray | None:
+        """Mask (F,) of the faces of caps; None: there are none."""
+        count = len(self.faces)
+        return np.arange(count) >= count - self.cap_faces if self.cap_faces else None
 
 
 def clean(
@@ -98,7 +108,7 @@ def clean(
     unreferenced = len(np.setdiff1d(representative, representative[faces]))
     if unreferenced:
         log.append(f"{unreferenced} unreferenced vertices removed")
-    faces = _remove_degenerate(vertices, representative[faces], name, log)
+    faces = without_degenerate(vertices, representative[faces], name, log)
     of_vertex = np.arange(len(vertices))
     if topology.edges_of(faces).count.max() > 2:
         faces, of_vertex = _split_edges(faces, name, repairs, log)
@@ -119,9 +129,14 @@ def clean(
         old = old[kept]
     merged = first_copies(old, len(vertices))[representative]
     points, split_faces, filled = fill(vertices[old], split_faces, repairs.fill_holes)
-    middles = holes.FIRST - np.arange(len(points) - len(old))
-    source = np.concatenate([old, middles])
-    return CleanMesh(points, split_faces, source, merged, (*log, *filled))
+    part = len(split_faces)
+    if repairs.closed_area is not None:
+        points, split_faces, closed = capped(points, split_faces, repairs.closed_area)
+        filled += closed
+    inserted = holes.FIRST - np.arange(len(points) - len(old))
+    source = np.concatenate([old, inserted])
+    caps = len(split_faces) - part
+    return CleanMesh(points, split_faces, source, merged, (*log, *filled), caps)
 
 
 def _check_size(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
@@ -186,134 +201,11 @@ def _makes_non_manifold(before: np.ndarray, after: np.ndarray) -> bool:
     """
 
     def most(faces: np.ndarray) -> int:
-        faces = faces[_distinct_corners(faces)]
-        faces = faces[_first_uses(faces)]
+        faces = faces[distinct_corners(faces)]
+        faces = faces[first_uses(faces)]
         return int(topology.edges_of(faces).count.max()) if len(faces) else 0
 
     return most(after) > 2 >= most(before)
-
-
-def _distinct_corners(faces: np.ndarray) -> np.ndarray:
-    a, b, c = faces.T
-    return (a != b) & (b != c) & (c != a)
-
-
-def _first_uses(faces: np.ndarray) -> np.ndarray:
-    """Mask (F,) of the faces that do not have the same three vertices as an earlier face."""
-    first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
-    mask = np.zeros(len(faces), dtype=bool)
-    mask[first] = True
-    return mask
-
-
-def _remove_degenerate(
-    vertices: np.ndarray, faces: np.ndarray, name: str, log: list[str]
-) -> np.ndarray:
-    """The faces without degenerate and duplicate ones."""
-    diagonal = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
-    limit = DEGENERATE_HEIGHT * diagonal
-    distinct = _distinct_corners(faces)
-    if not distinct.all():
-        log.append(f"{int((~distinct).sum())} faces with a repeated vertex removed")
-    faces = faces[distinct]
-    degenerate = _is_degenerate(vertices, faces, limit)
-    if degenerate.all():
-        raise error_in(name, "degenerate", "all triangles are degenerate; give another mesh")
-    if degenerate.any():
-        # removing a degenerate triangle inside would leave a hole: only an edge flip keeps the
-        # surface closed
-        before = topology.euler_characteristic(faces[_first_uses(faces)])
-        faces, flipped, removed = _flip_degenerate(vertices, faces, degenerate, limit)
-        kept = faces[_first_uses(faces)]
-        if len(kept) == 0 or topology.euler_characteristic(kept) != before:
-            where = f"removing {removed} degenerate triangles would leave holes"
-            reason = f"{where}; merge vertices by distance in a mesh editor"
-            raise error_in(name, "degenerate", reason)
-        if flipped:
-            log.append(f"{flipped} degenerate triangles removed by edge flips")
-        if removed:
-            log.append(f"{removed} degenerate triangles removed")
-    first = _first_uses(faces)
-    if not first.all():
-        log.append(f"{int((~first).sum())} duplicate faces removed")
-    return faces[first]
-
-
-def _is_degenerate(vertices: np.ndarray, faces: np.ndarray, limit: float) -> np.ndarray:
-    """Mask (F,) of the faces whose height over their longest side is below twice the limit."""
-    corners = vertices[faces]
-    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
-    return topology.face_areas(vertices, faces) <= limit * longest
-
-
-def _flip_degenerate(
-    vertices: np.ndarray, faces: np.ndarray, degenerate: np.ndarray, limit: float
-) -> tuple[np.ndarray, int, int]:
-    """Flip the longest edge of each degenerate face (mask (F,)), or remove the face.
-
-    A degenerate face between others may become flippable once its neighbour is, so the passes
-    repeat until nothing changes.
-
-    Returns:
-        The faces (G, 3), how many were flipped and how many removed.
-    """
-    faces = faces.copy()
-    faces_at: dict[tuple[int, int], set[int]] = {}
-    for f, face in enumerate(faces.tolist()):
-        for edge in _sides(face):
-            faces_at.setdefault(edge, set()).add(f)
-    left = np.flatnonzero(degenerate).tolist()
-    flipped, changed = 0, True
-    while changed:
-        changed = False
-        for f in list(left):
-            g = _flip(vertices, faces, faces_at, f, limit)
-            if g is not None:
-                left = [h for h in left if h not in (f, g)]
-                flipped += 1
-                changed = True
-    return np.delete(faces, left, axis=0), flipped, len(left)
-
-
-def _flip(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    faces_at: dict[tuple[int, int], set[int]],
-    f: int,
-    limit: float,
-) -> int | None:
-    """Flip the longest edge of face f in place; the other face, or None if it cannot be flipped.
-
-    Both new faces must have an area, and the new edge must not exist yet.
-    """
-    a, b, c = faces[f].tolist()
-    p, q, r = max(
-        [(a, b, c), (b, c, a), (c, a, b)],
-        key=lambda side: float(np.linalg.norm(vertices[side[0]] - vertices[side[1]])),
-    )
-    beyond = faces_at[min(p, q), max(p, q)] - {f}
-    if len(beyond) != 1:
-        return None
-    g = beyond.pop()
-    s = next(v for v in faces[g].tolist() if v not in (p, q))
-    if s == r or faces_at.get((min(r, s), max(r, s))):
-        return None
-    pair = np.array([(r, p, s), (r, s, q)], dtype=np.int64)
-    if _is_degenerate(vertices, pair, limit).any():
-        return None
-    for h, new in zip((f, g), pair, strict=True):
-        for edge in _sides(faces[h].tolist()):
-            faces_at[edge].discard(h)
-        faces[h] = new
-    for h in (f, g):
-        for edge in _sides(faces[h].tolist()):
-            faces_at.setdefault(edge, set()).add(h)
-    return g
-
-
-def _sides(face: list[int]) -> list[tuple[int, int]]:
-    a, b, c = face
-    return [(min(a, b), max(a, b)), (min(b, c), max(b, c)), (min(c, a), max(c, a))]
 
 
 def _split_edges(

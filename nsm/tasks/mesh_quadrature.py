@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -73,6 +73,11 @@ class MeshQuadrature(nn.Module):
         self._surface = [surface]  # not a part of this module
         self._taken: tuple[int, Triangles] | None = None
 
+    @property
+    def surface(self) -> Any:
+        """φ."""
+        return self._surface[0]
+
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_taken": None}
 
@@ -82,8 +87,7 @@ class MeshQuadrature(nn.Module):
         of equal area, if these are fewer."""
         if self._taken is not None and self._taken[0] == count:
             return self._taken[1]
-        [surface] = self._surface
-        points = torch.cat([surface(part) for part in self.uv.split(_AT_ONCE)])
+        points = torch.cat([self.surface(part) for part in self.uv.split(_AT_ONCE)])
         whole = _triangles(self.uv, self.faces, points)
         if count < len(self.faces) > _ALL:
             ends = whole.share.double().cumsum(0)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from nsm.data import Samples
 from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import Composition, LatticeAligned, Rotated
+from nsm.tasks.caps import Caps
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier
@@ -37,6 +38,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         mesh: uv (V, 2) and faces (F, 3) of the source, whose triangles must not flip.
         diagonal: of the target's bounding box, the unit of the logged errors.
         phi, psi: source and target; neither is trained.
+        caps: (F,) mask of the faces of caps, whose distortion does not count; None: none.
 
     Raises:
         ValueError: a constraint that is not known.
@@ -62,6 +64,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         diagonal: float,
         phi: nn.Module,
         psi: nn.Module,
+        caps: Tensor | None = None,
         loss_terms: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
@@ -74,7 +77,10 @@ class PairMap(ConstrainedMap, OneMeshMap):
         self.image = Composition(self.psi, self.map)
         held = self.constraints
         self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
-        self._set_quadrature(held.triangles_from, max_steps, *mesh, self.phi)
+        uv, faces = mesh
+        part = faces if caps is None else faces[~caps]
+        self._set_quadrature(held.triangles_from, max_steps, uv, part, self.phi)
+        self.caps = None if caps is None else Caps(uv, faces[caps], self.phi, held.injectivity)
         self.diagonal = diagonal
         self.set_landmarks(points, targets, self.map.before(points), seam)
 
@@ -91,6 +97,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
+        K = self._cap_term() if self.caps is not None else 0.0
         C, multipliers = self.landmark_terms()
 
         loss = (
@@ -100,6 +107,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
             + w.boundary * B
             + ramp * w.seam * S
             + w.triangles * U
+            + K
             + self.landmark_weight * C
         )
         terms: dict[str, Term] = {
@@ -109,6 +117,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
             "boundary": (w.boundary, B),
             "seam": (ramp * w.seam, S),
             "triangles": (w.triangles, U),
+            "caps": (1.0, K),
             "landmarks": (self.landmark_weight, C),
         }
         for name, term in self.loss_terms.items():
@@ -139,6 +148,11 @@ class PairMap(ConstrainedMap, OneMeshMap):
         _, outer = self.psi.value_and_jacobian(image)  # type: ignore[operator]
         return source, first_fundamental_form(outer @ jacobian), jacobian, image
 
+    def _cap_term(self) -> Tensor:
+        assert self.caps is not None
+        w, step = self.loss_weights.injectivity, self.global_step
+        return self.caps(self.map, self.psi, self.energy, w, step)
+
     def curvatures(self) -> list[Curvature]:
         w = self.loss_weights
         uv, at, share = self._places(self.batch)  # of triangles, nearly theirs
@@ -154,6 +168,9 @@ class PairMap(ConstrainedMap, OneMeshMap):
 
         hessians = share.double()[:, None, None] * positive_hessians(energy, jacobian)
         found = [Curvature(self.map, uv, hessians)]
+        if self.caps is not None:
+            step = self.global_step
+            found.append(self.caps.curvature(self.map, self.psi, self.energy, w.injectivity, step))
         if len(self.points):
             of_landmarks = 2 * self.landmark_weight * torch.eye(2).to(uv)
             found.append(

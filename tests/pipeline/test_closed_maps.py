@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import nsm
 from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.domains.orbifold.alignment import alignments
+from nsm.domains.orbifold.domain import Orbifold
 from nsm.errors import NsmError
 from nsm.pipeline.automatic_domain import choose_domain
 from nsm.results.metrics import evaluate
@@ -250,6 +252,32 @@ def test_a_wrong_isotopy_class_is_noticed_and_the_next_is_tried(shapes, tmp_path
     summary = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert summary["isotopy_class"] == 1 and len(summary["isotopy_classes"]) > 1
     assert f.config["isotopy_class"] == 1
+
+
+def test_the_best_of_the_classes_that_were_tried_is_taken(monkeypatch):
+    """The second class ends worse than the first, which missed its landmarks by a little."""
+    from nsm.pipeline import pair_map
+
+    task = pair_map.PairMapTask("pair_map")
+    task.domain, task.console = Orbifold(), Console(quiet=True)
+    surface = SimpleNamespace(part=None, bounding_box_diagonal=5.0)
+    task.surface, task.psi = surface, SimpleNamespace(surface=surface)
+    task.config, task.tried = SimpleNamespace(isotopy_class=0), {}
+    task.alignments = [SimpleNamespace(distortion=d) for d in (1.9, 2.5, 2.6, 2.7)]
+    monkeypatch.setattr(task, "make_result", lambda m: SimpleNamespace(part=m))
+    monkeypatch.setattr(pair_map, "mean_log_distortion", lambda _, image: image)
+    ends = {0: (1.8, 1.1), 1: (2.3, 1.5), 2: (2.2, 0.0)}
+
+    def trained():
+        after, missed = ends[task.config.isotopy_class]
+        return SimpleNamespace(
+            image=after, points=[0], landmark_error=lambda: torch.tensor([missed])
+        )
+
+    order = [0]
+    while task.begin_again(trained()):
+        order.append(task.config.isotopy_class)
+    assert order == [0, 1, 2, 0]
 
 
 def test_a_class_that_is_not_there_is_refused(shapes):

@@ -1,6 +1,7 @@
 """PairMap and CollectionMap: known maps are found, constraints hold, runs resume."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -120,6 +121,20 @@ def test_the_identity_between_equal_surfaces_is_the_minimum():
     energy, determinant, image = evaluated(module, samples())
     assert energy.mean.item() == pytest.approx(2 + 2 / 1.01, rel=1e-5)
     assert (determinant == 1).all() and (image == samples()).all()
+
+
+def test_the_distortion_of_caps_hardly_counts_but_they_must_not_fold():
+    """Triangles of the quadrature are those of the part; the barrier against folds has all."""
+    caps = torch.zeros(len(MESH[1]), dtype=torch.bool)
+    caps[:3] = True
+    changes = {"caps": caps, "constraints": {**CONSTRAINTS, "triangles_from": 0.0}}
+    module = pair(surface("saddle"), surface("saddle"), **changes)
+    assert torch.equal(module.quadrature.faces, MESH[1][~caps])
+    assert torch.equal(module.caps.quadrature.faces, MESH[1][caps])
+    assert len(module.fold_barrier.faces) == len(MESH[1])
+    loss = module.training_step(Batch(samples()), 0)
+    least = 2 + 2 / 1.01
+    assert loss.item() == pytest.approx(least + 0.01 * math.log1p(least), rel=1e-4)
 
 
 def test_an_isometry_between_different_surfaces_is_the_minimum():

@@ -141,6 +141,7 @@ def _both_ends(
     f: SurfaceMap,
 ) -> tuple[Callable[[str], Shape], Callable[[str], Shape], Distortion]:
     """Functions from a name to the image and to the source, and the map's distortion."""
+    f = f.part
     surface = f.source.surface
     distortion = _measured(surface.vertices, f.image, surface.faces)
     # a point and its image get the same colour, which shows the correspondence

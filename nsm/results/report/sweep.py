@@ -17,13 +17,14 @@ from nsm.results.files import atomic_write
 from nsm.results.metrics import evaluate
 from nsm.results.pair_pictures import distorted
 from nsm.results.parameterization import load_parameterization
-from nsm.results.pictures import GREY, checked, fine, layout_image, panels, save_figure
+from nsm.results.pictures import checked, fine, layout_image, panels, save_figure
 from nsm.results.render import Blend, View, vertex_normals
 from nsm.results.report.labels import OverSeeds, labels, over_seeds
 from nsm.results.report.runs import Run, find_runs
 from nsm.results.stored_map import load_surface_map
 from nsm.results.surface_map import SurfaceMap
 from nsm.results.tables import FIGURES
+from nsm.results.textures import GREY
 
 FIGURE, TABLE = "sweep.png", "sweep.csv"
 _ROWS, _LINES = 16, 40  # at most, in the figure and in what is printed
@@ -160,6 +161,7 @@ def _collection_map(folder: Path, trust: Sequence[str]) -> _Panels:
 
 
 def _pair(f: SurfaceMap) -> _Panels:
+    f = f.part
     source = f.source.surface
     view, image = View(source.vertices, _SIDE), f.aligned_image
     other = View(image, _SIDE, frame=view.frame)

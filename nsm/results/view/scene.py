@@ -17,9 +17,10 @@ from nsm.results.meshes import by_position
 from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.pair_metrics import triangle_energies
 from nsm.results.parameterization import Parameterization
-from nsm.results.pictures import GREY, vertex_means
+from nsm.results.pictures import vertex_means
 from nsm.results.render import frames_of, vertex_normals
 from nsm.results.surface_map import SurfaceMap
+from nsm.results.textures import GREY
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import edges_of
 
@@ -28,6 +29,7 @@ _GAP = 0.2  # between the shapes, in widths of the wider one
 _FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; others use percentiles
 _LARGEST = 1e3
 _NO_VERTICES = np.zeros(0, dtype=np.int64)
+_ONE_SQUARE = np.array([1 / 32, 1 / 32])  # the middle of a square of the checkerboard
 _FIELD_OF_VIEW = np.radians(18)  # narrow: both shapes are seen from the same direction
 _ASPECT, _ASIDE = 1.5, 0.26  # of a browser window, with the panel at its right
 
@@ -121,6 +123,8 @@ class Scene:
         energies: for each name, values (F,) on the source's triangles.
         errors: for each name, values (V,) at its vertices.
         locate: where points (N, 2) of the target's domain lie on a mesh over it: uv (V, 2), faces.
+        unreached: mask (W,) of the target's vertices to which no point of the source goes; None:
+            there are none.
     """
 
     source: Shape
@@ -132,6 +136,7 @@ class Scene:
     energies: dict[str, np.ndarray]
     errors: dict[str, np.ndarray] = field(default_factory=dict)
     locate: Callable[[np.ndarray, np.ndarray, np.ndarray], Places] = locate
+    unreached: np.ndarray | None = None
 
     @property
     def shapes(self) -> tuple[Shape, Shape]:
@@ -166,17 +171,25 @@ class Scene:
         """The paint of both shapes; a point and its image have the same colour."""
         if name in self.checkerboards:
             checkerboard = self.checkerboards[name]
-            return Paint(None, checkerboard), Paint(None, self.transferred(checkerboard))
+            carried = self._shown(self.transferred(checkerboard), _ONE_SQUARE)
+            return Paint(None, checkerboard), Paint(None, carried)
         vertices = self.source.vertices
         scale = self.scale(name)
         if scale is not None:
             values = self._at_vertices(name)
             on_target = self.transferred(values)
-            return Paint(scale.colours(values), None), Paint(scale.colours(on_target), None)
+            carried = self._shown(scale.colours(on_target), GREY)
+            return Paint(scale.colours(values), None), Paint(carried, None)
         colours = np.tile(GREY, (len(vertices), 1))
         if name == POSITION:
             colours = by_position(vertices)
-        return Paint(colours, None), Paint(self.transferred(colours), None)
+        return Paint(colours, None), Paint(self._shown(self.transferred(colours), GREY), None)
+
+    def _shown(self, carried: np.ndarray, nothing: np.ndarray) -> np.ndarray:
+        """Values (W, d) at the target's vertices, with ``nothing`` (d,) where no point goes."""
+        if self.unreached is None:
+            return carried
+        return np.where(self.unreached[:, None], nothing, carried)
 
     def scale(self, name: str) -> Scale | None:
         """The colour scale of an energy or error; None for other colourings."""
@@ -232,7 +245,7 @@ def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y
     """
     mesh = result.source if isinstance(result, SurfaceMap) else result
     mesh = mesh.phi if isinstance(mesh, Parameterization) else mesh
-    frame = frames_of(mesh.surface.vertices)[up]
+    frame = frames_of(mesh.surface.part.vertices)[up]
     if isinstance(result, SurfaceMap):
         return _pair(result, frame)
     if isinstance(result, Parameterization):
@@ -270,6 +283,8 @@ def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
 
 
 def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
+    unreached = f.unreached if f.unreached.any() else None
+    f = f.part
     s, t = f.source.surface, f.target.surface
     turned = f.aligned(t.vertices)
     centre = _centre(turned, frame)
@@ -280,7 +295,7 @@ def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
     image = f.aligned_image - centre
     energies, locate = _energies(s, f.image), s.domain.locate
     shown = (source, target, f.image_uv, image, frame)
-    return Scene(*shown, checkerboards, energies, locate=locate)
+    return Scene(*shown, checkerboards, energies, locate=locate, unreached=unreached)
 
 
 def _file_shape(
