@@ -14,9 +14,9 @@ runs the library's default phases, and writes the image of each vertex of the so
 
 ``benchmarks/nearest_points.py`` is such a program, the simplest one.
 
-Seconds are CPU time from files to files. Flips are triangles whose image is turned against the
-target's normal where it lies, or is no triangle; before repair, what the network alone turns over.
-Only nsm repairs.
+Seconds are CPU time from files to files. Triangles are turned over whose image on the target is
+turned against its normal there, or is no triangle: that is known of any map. Flips are those of the
+map of Ω, or of the flattening, with what the network alone flips before repair; only nsm repairs.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ COLUMNS = {
     "symmetric_dirichlet_p95": "95th percentile",
     "flipped_before_repair_percent": "flipped % before repair",
     "flipped_percent": "after",
+    "turned_percent": "turned over %",
     "landmark_error_mean_percent": "landmarks, mean %",
     "landmark_error_max_percent": "largest %",
 }
@@ -75,8 +76,7 @@ def figures(source: Mesh, target: Mesh, image: np.ndarray, marks: np.ndarray) ->
     near = igl.point_mesh_squared_distance(middle, np.ascontiguousarray(other), other_faces)[1]
     corner = other[other_faces[near]]
     outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    found["flipped_percent"] = 100 * float(((normal * outwards).sum(axis=1) <= 0).mean())
-    found["flipped_before_repair_percent"] = found["flipped_percent"]
+    found["turned_percent"] = 100 * float(((normal * outwards).sum(axis=1) <= 0).mean())
     off = np.linalg.norm(image[marks[:, 0]] - other[marks[:, 1]], axis=1)
     off *= 100 / np.linalg.norm(np.ptp(other, axis=0))
     found["landmark_error_mean_percent"] = float(off.mean())
@@ -150,7 +150,7 @@ def by_nsm(
     image = by_file_vertex(f.source.surface, f.target.in_original_units(f.welded_image))
     meshes = [load_mesh(file)[:2] for file in files]
     found = figures(*meshes, image, marks)
-    found["flipped_before_repair_percent"] = f.metrics["flipped_before_repair_percent"]
+    found |= {key: f.metrics[key] for key in ("flipped_before_repair_percent", "flipped_percent")}
     start = {key.removeprefix("start_"): v for key, v in f.metrics.items() if key[:6] == "start_"}
     start["flipped_before_repair_percent"] = start["flipped_percent"]
     return {"seconds": round(seconds, 1), **found}, _chosen(start)
