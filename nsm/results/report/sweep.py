@@ -31,7 +31,12 @@ _SIDE = 420
 # of the table that is printed; the file has all figures
 _PRINTED = {
     "overfit": ("rms_percent", "normal_error_mean_degrees", "normal_variation_error_degrees"),
-    "": ("symmetric_dirichlet_median", "singular_value_ratio_median", "flipped_percent"),
+    "": (
+        "symmetric_dirichlet_median",
+        "singular_value_ratio_median",
+        "flipped_before_repair_percent",
+        "flipped_percent",
+    ),
 }
 _Panels = list[tuple[np.ndarray, str]]
 
