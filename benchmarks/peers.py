@@ -224,11 +224,16 @@ def main() -> None:
                 known[given.name] = by_command(given.command, *meshes, marks)
             except RuntimeError as error:
                 print(f"{given.name}, {pair}: {error}")
+        _keep(results)
     for name in given.flatten:
         results[f"flattening {Path(name).stem}"] = flattened(given.meshes / name)
+        _keep(results)
+    print(table(results))
+
+
+def _keep(results: dict[str, Any]) -> None:
     RESULTS.write_text(json.dumps(results, indent=1) + "\n")
     RESULTS.with_suffix(".md").write_text(table(results))
-    print(table(results))
 
 
 if __name__ == "__main__":
