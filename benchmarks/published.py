@@ -228,6 +228,17 @@ MAP_COLUMNS = {
 }
 
 
+def _as_it_starts(key: str, metrics: dict[str, float], columns: dict[str, str]) -> list[str]:
+    """The row of the default's map as h starts, where nothing is repaired."""
+    what, _, stage = key.partition("/")
+    start = {name.removeprefix("start_"): v for name, v in metrics.items() if name[:6] == "start_"}
+    if stage != "default" or not start:
+        return []
+    start["flipped_before_repair_percent"] = start["flipped_percent"]
+    cells = [f"{start[name]:.3f}" if name in start else "–" for name in columns]
+    return [f"| {what}, default, as h starts | 0 | 0 | {' | '.join(cells)} |"]
+
+
 def tables(file: Path) -> str:
     """The result file as Markdown."""
     found = json.loads(file.read_text())
@@ -239,6 +250,7 @@ def tables(file: Path) -> str:
         lines = [f"| training | seconds | steps | {' | '.join(columns.values())} |"]
         lines.append("|---" * (3 + len(columns)) + "|")
         for key, entry in shown.items():
+            lines += _as_it_starts(key, entry["metrics"], columns)
             told = [entry["metrics"].get(name) for name in columns]
             figures = " | ".join("–" if one is None else f"{one:.3f}" for one in told)
             spent = f"{entry['seconds']:.0f} | {entry['steps']}"
