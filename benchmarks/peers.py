@@ -195,9 +195,10 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     lines = [f"| shapes | method | {' | '.join(COLUMNS.values())} |"]
     lines.append("|---" * (len(COLUMNS) + 2) + "|")
     for case, ways in results.items():
+        shown = case if case.startswith("flattening") else case.replace("-", " → ")
         for way, found in ways.items():
             cells = [f"{found[key]:.3f}" if key in found else "–" for key in COLUMNS]
-            lines.append(f"| {case.replace('-', ' → ')} | {way} | {' | '.join(cells)} |")
+            lines.append(f"| {shown} | {way} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
