@@ -212,8 +212,9 @@ class Surface:
             if seam is not None:
                 seam = _merged(seam, mesh, name, "seam_vertices")
             around = _merged(inside, mesh, name, "off_seam")
-            how = {"seam_vertices": seam, "avoided": around}
-            cut = cut_to_disc(mesh.vertices, mesh.faces, **how, name=name)
+            cut = cut_to_disc(
+                mesh.vertices, mesh.faces, seam_vertices=seam, avoided=around, name=name
+            )
             surface = cls.from_cut(cut, mesh, **about)
         else:
             if corners is not None:
