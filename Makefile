@@ -35,8 +35,8 @@ bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
 	$(BIN)/python benchmarks/closed_maps.py $(if $(MESHES),--meshes $(MESHES))
 
-# Whole trainings by the published recipe beside the default: half an hour in the reduced form, FORM=full
-# on a GPU. MESHES as above.
+# Whole trainings by the published recipe beside the default: a quarter of an hour in the reduced
+# form, FORM=full on a GPU. MESHES as above.
 FORM ?= reduced
 bench-published: .venv/.nsm-dev
 	$(BIN)/python benchmarks/published.py --form $(FORM) --meshes $(MESHES)
@@ -56,7 +56,7 @@ bench-correspondence: .venv/.nsm-dev
 bench-partial: .venv/.nsm-dev
 	$(BIN)/python benchmarks/partial.py $(if $(MESHES),--meshes $(MESHES))
 
-# One network with each activation, its wrinkles, and a report on the runs: half an hour.
+# The sweep of activations, with close-ups and a report on the runs: a quarter of an hour.
 bench-activation: .venv/.nsm-dev
 	$(BIN)/python benchmarks/activation.py $(if $(MESHES),--meshes $(MESHES))
 

@@ -40,6 +40,9 @@ KEPT = (
     "seam_gap_mean_percent",
     "seam_gap_max_percent",
     "certified",
+    "flipped_before_repair_percent",
+    "start_symmetric_dirichlet_median",
+    "start_flipped_percent",
 )
 START = ["trainer.max_steps=1", "artefacts=false", "certification.repair=false"]  # fills the cache
 
@@ -94,7 +97,7 @@ def collection(files: Sequence[str], marks: Sequence[str], domain: str) -> dict[
         for key in ("landmark_error_max_percent", "seam_gap_max_percent")
         if all(key in of for of in every)
     }
-    averages = {key: mean(of[key] for of in every) for key in KEPT[:4]}
+    averages = {key: mean(of[key] for of in every) for key in (*KEPT[:4], *KEPT[-3:])}
     cycles = {key: value for key, value in group.metrics.items() if key.startswith("cycle")}
     certified = {"certified": group.metrics["certified"]}
     return {"map_seconds": seconds, **averages, **worst, **cycles, **certified}
@@ -150,9 +153,12 @@ def _shapes(meshes: Path, numbers: Sequence[str], ending: str) -> tuple[list[str
 
 
 COLUMNS = {
+    "start_symmetric_dirichlet_median": "median as h starts",
     "symmetric_dirichlet_median": "median",
     "symmetric_dirichlet_mean": "mean",
     "symmetric_dirichlet_p95": "95th percentile",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "flipped %",
     "landmark_error_max_percent": "landmark error, largest %",
     "seam_gap_max_percent": "torn by at most %",
     "map_seconds": "seconds",
@@ -173,12 +179,12 @@ def tables() -> str:
             name = found["case"] if domain == "disc" else ""
             rows.append([name, domain, *row, "yes" if of["certified"] else "no"])
         for key, values in ratios.items():
-            if key in found["disc"] and key in found[closed]:
+            if found["disc"].get(key) and key in found[closed]:
                 values.append(found[closed][key] / found["disc"][key])
     means = [
         f"{label} {mean(values):.2f}"
         for (key, label), values in zip(COLUMNS.items(), ratios.values(), strict=True)
-        if values and "landmark" not in key
+        if values and not key.startswith(("landmark", "flipped", "start"))
     ]
     shown = table(["map", "domain", *COLUMNS.values(), "certified"], rows)
     return f"{shown}\n\nClosed domain over disc, mean of the ratios: {', '.join(means)}.\n"

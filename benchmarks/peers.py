@@ -12,8 +12,11 @@ if the template ends a word with {image}.obj or {image}.off. Without a command, 
 with a program for each of its figures. A program for this command reads the meshes and landmarks,
 runs the library's default phases, and writes the image of each vertex of the source.
 
-Seconds are CPU time from files to files. Flips are triangles whose image is turned against the
-target's normal where it lies, or is no triangle.
+``benchmarks/nearest_points.py`` is such a program, the simplest one.
+
+Seconds are CPU time from files to files. Triangles are turned over whose image on the target is
+turned against its normal there, or is no triangle: that is known of any map. Flips are those of the
+map of Ω, or of the flattening, with what the network alone flips before repair; only nsm repairs.
 """
 
 from __future__ import annotations
@@ -46,7 +49,9 @@ COLUMNS = {
     "seconds": "seconds",
     "symmetric_dirichlet_median": "median",
     "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_percent": "flipped %",
+    "flipped_before_repair_percent": "flipped % before repair",
+    "flipped_percent": "after",
+    "turned_percent": "turned over %",
     "landmark_error_mean_percent": "landmarks, mean %",
     "landmark_error_max_percent": "largest %",
 }
@@ -71,7 +76,7 @@ def figures(source: Mesh, target: Mesh, image: np.ndarray, marks: np.ndarray) ->
     near = igl.point_mesh_squared_distance(middle, np.ascontiguousarray(other), other_faces)[1]
     corner = other[other_faces[near]]
     outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    found["flipped_percent"] = 100 * float(((normal * outwards).sum(axis=1) <= 0).mean())
+    found["turned_percent"] = 100 * float(((normal * outwards).sum(axis=1) <= 0).mean())
     off = np.linalg.norm(image[marks[:, 0]] - other[marks[:, 1]], axis=1)
     off *= 100 / np.linalg.norm(np.ptp(other, axis=0))
     found["landmark_error_mean_percent"] = float(off.mean())
@@ -126,8 +131,11 @@ def _seconds_of_children() -> float:
     return spent.children_user + spent.children_system
 
 
-def by_nsm(files: list[Path], marks: np.ndarray, overrides: list[str]) -> dict[str, float]:
-    """The same of nsm's map from raw files, with an empty cache and one thread."""
+def by_nsm(
+    files: list[Path], marks: np.ndarray, overrides: list[str]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """The same of nsm's map from raw files, with an empty cache and one thread, and its figures
+    as h starts: the parameterizations, composed."""
     before, kept = os.times(), os.environ.get("NSM_CACHE")
     with tempfile.TemporaryDirectory() as cache:
         os.environ["NSM_CACHE"] = cache
@@ -141,7 +149,11 @@ def by_nsm(files: list[Path], marks: np.ndarray, overrides: list[str]) -> dict[s
     seconds = sum(after[:4]) - sum(before[:4])
     image = by_file_vertex(f.source.surface, f.target.in_original_units(f.welded_image))
     meshes = [load_mesh(file)[:2] for file in files]
-    return {"seconds": round(seconds, 1), **figures(*meshes, image, marks)}
+    found = figures(*meshes, image, marks)
+    found |= {key: f.metrics[key] for key in ("flipped_before_repair_percent", "flipped_percent")}
+    start = {key.removeprefix("start_"): v for key, v in f.metrics.items() if key[:6] == "start_"}
+    start["flipped_before_repair_percent"] = start["flipped_percent"]
+    return {"seconds": round(seconds, 1), **found}, _chosen(start)
 
 
 def flattened(file: Path) -> dict[str, dict[str, float]]:
@@ -183,9 +195,10 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     lines = [f"| shapes | method | {' | '.join(COLUMNS.values())} |"]
     lines.append("|---" * (len(COLUMNS) + 2) + "|")
     for case, ways in results.items():
+        shown = case if case.startswith("flattening") else case.replace("-", " → ")
         for way, found in ways.items():
             cells = [f"{found[key]:.3f}" if key in found else "–" for key in COLUMNS]
-            lines.append(f"| {case.replace('-', ' → ')} | {way} | {' | '.join(cells)} |")
+            lines.append(f"| {shown} | {way} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -205,17 +218,23 @@ def main() -> None:
         files, marks = pair_of(given.meshes, pair)
         known = results.setdefault(pair, {})
         for way in given.ways:
-            known[way] = by_nsm(files, marks, OURS[way])
+            known[way], known[f"{way}, as h starts"] = by_nsm(files, marks, OURS[way])
         if given.command:
             meshes = [load_mesh(file)[:2] for file in files]
             try:
                 known[given.name] = by_command(given.command, *meshes, marks)
             except RuntimeError as error:
                 print(f"{given.name}, {pair}: {error}")
+        _keep(results)
     for name in given.flatten:
         results[f"flattening {Path(name).stem}"] = flattened(given.meshes / name)
-    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+        _keep(results)
     print(table(results))
+
+
+def _keep(results: dict[str, Any]) -> None:
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+    RESULTS.with_suffix(".md").write_text(table(results))
 
 
 if __name__ == "__main__":

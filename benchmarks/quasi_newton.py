@@ -26,7 +26,9 @@ WAYS = {
 }
 FIGURES = (
     *(f"symmetric_dirichlet_{k}" for k in ("median", "mean", "p95")),
-    *("flipped_percent", "landmark_error_mean_percent", "landmark_error_max_percent", "certified"),
+    *(f"start_symmetric_dirichlet_{k}" for k in ("median", "p95")),
+    *("flipped_before_repair_percent", "flipped_percent"),
+    *("landmark_error_mean_percent", "landmark_error_max_percent", "certified"),
 )
 
 

@@ -40,6 +40,7 @@ _FIGURES = (
     "symmetric_dirichlet_median",
     "symmetric_dirichlet_mean",
     "symmetric_dirichlet_p95",
+    "flipped_before_repair_percent",
     "flipped_percent",
     "landmark_error_max_percent",
     "seam_gap_mean_percent",

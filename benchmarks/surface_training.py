@@ -23,7 +23,9 @@ RESULTS = Path(__file__).parent / "results" / "surface_training.json"
 STEPS = (1, 250, 1000)
 FIGURES = (
     *(f"symmetric_dirichlet_{k}" for k in ("median", "mean", "p95")),
-    *("flipped_percent", "landmark_error_mean_percent", "landmark_error_max_percent", "certified"),
+    *(f"start_symmetric_dirichlet_{k}" for k in ("median", "p95")),
+    *("flipped_before_repair_percent", "flipped_percent"),
+    *("landmark_error_mean_percent", "landmark_error_max_percent", "certified"),
 )
 
 

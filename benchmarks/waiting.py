@@ -157,7 +157,8 @@ def run(case: str, meshes: Path, extra: list[str]) -> dict[str, Any]:
     kept = (
         *(f"symmetric_dirichlet_{k}" for k in ("median", "p95")),
         *(f"landmark_error_{k}_percent" for k in ("mean", "max")),
-        *("flipped_percent", "certified", "rms_percent", "normal_error_mean_degrees"),
+        *("flipped_before_repair_percent", "flipped_percent", "certified"),
+        *("rms_percent", "normal_error_mean_degrees"),
     )
     return {
         "stages": spent,

@@ -146,6 +146,10 @@ def test_the_table_quotes_the_method(shared_meshes):
             assert words is None or words in method, f"{key}: {words}"
 
 
+def test_the_pool_of_samples_has_one_size():
+    assert compose_config(["sampler=pool"]).sampler.pool == paper("overfit").sampler.pool
+
+
 @pytest.mark.parametrize("task", TASKS[1:])
 def test_the_surfaces_of_maps_are_the_papers(task):
     config = paper(task)

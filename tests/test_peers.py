@@ -45,14 +45,14 @@ def test_an_exact_similarity_has_the_least_distortion(tmp_path, meshes):
     least = 2 + 2 / 1.01  # symmetric Dirichlet of an isometry (METHOD, Eq. 2)
     assert found["symmetric_dirichlet_median"] == pytest.approx(least, abs=1e-5)
     assert found["symmetric_dirichlet_p95"] == pytest.approx(least, abs=1e-5)
-    assert found["flipped_percent"] == 0 and found["landmark_error_max_percent"] < 1e-5
+    assert found["turned_percent"] == 0 and found["landmark_error_max_percent"] < 1e-5
     assert found["seconds"] >= 0
 
 
 def test_flips_and_missed_landmarks_are_seen(tmp_path, meshes):
     """A reflection turns all triangles; two of the landmarks are not on the mirror."""
     found = peers.by_command(peer(tmp_path, "moved[:, 1] *= -1"), *meshes, MARKS)
-    assert found["flipped_percent"] > 99
+    assert found["turned_percent"] > 99
     (vertices, _), (other, _) = meshes
     y = vertices[MARKS[:, 0], 1]
     off = 100 * 4 * np.abs(y) / np.linalg.norm(np.ptp(other, axis=0))
@@ -65,7 +65,7 @@ def test_a_mesh_may_be_written_in_place_of_points(tmp_path, meshes):
     write += "open(image, 'w').writelines(['v %r %r %r\\n' % tuple(map(float, x)) for x in moved])"
     write += "\nopen(image, 'a').writelines(faces); sys.exit()"
     found = peers.by_command(peer(tmp_path, write), *meshes, MARKS)
-    assert found["flipped_percent"] == 0 and found["landmark_error_max_percent"] < 1e-5
+    assert found["turned_percent"] == 0 and found["landmark_error_max_percent"] < 1e-5
 
 
 @pytest.mark.parametrize(

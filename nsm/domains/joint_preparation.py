@@ -79,7 +79,7 @@ def prepare_jointly(
         domain, parameterization, cache, repairs: as for :meth:`Surface.load`.
         seam: ``shortest`` paths, or ``hidden`` ones, which prefer regions seen from few sides; or
             ``auto``, which tries both and keeps the seam for which the domains agree best; or
-            ``own``: each mesh is cut by itself.
+            ``own``: each mesh is cut by itself, around its landmarks.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
             all of them, or, with ``auto``, the number for which the domains agree best.
         processes: how many meshes are laid out at once, as for
@@ -112,8 +112,10 @@ def prepare_jointly(
         and needs_common_boundaries(cleaned, common_ids[0])
     )
     if apart or not several and (common != (0, 0) or not enough):
+        # apart, seams cannot pass one landmark in corresponding places
+        inside = landmarks if apart else [np.zeros(0, np.int64)] * len(meshes)
 
-        def alone(m: Mesh) -> Surface:
+        def alone(m: Mesh, ids: np.ndarray) -> Surface:
             return Surface.from_arrays(
                 m.vertices,
                 m.faces,
@@ -123,9 +125,10 @@ def prepare_jointly(
                 cache=cache,
                 log=m.log,
                 repairs=m.decided(repairs),
+                off_seam=ids[ids >= 0].tolist(),
             )
 
-        return _laid_out(alone, list(zip(meshes)), processes)
+        return _laid_out(alone, list(zip(meshes, inside, strict=True)), processes)
     digest = hashlib.sha256()
     for c, ids in zip(cleaned, found, strict=True):
         for array in (c.vertices, c.faces, ids):

@@ -156,11 +156,13 @@ class Surface:
         log: Sequence[str] = (),
         repairs: Repairs = NO_DECISION,
         uv: np.ndarray | None = None,
+        off_seam: Sequence[int] = (),
     ) -> Surface:
         """Validate, cut, normalise and parameterise a mesh (V, 3), (F, 3).
 
         The arguments are those of :meth:`load`; ``uv`` (F, 3, 2) are texture coordinates at the
-        faces' corners, for ``parameterization="given"``. ``quality`` holds flipped_triangles,
+        faces' corners, for ``parameterization="given"``; ``off_seam`` are vertices that the seam of
+        a domain with boundary goes around where it can. ``quality`` holds flipped_triangles,
         median_symmetric_dirichlet (of the map from Ω to the mesh) and seconds; on a domain with
         boundary also boundary_self_intersections, tutte_median_symmetric_dirichlet (for large
         meshes, Tutte's of the coarse mesh) and seam_vertices (the number of ``seam_pairs``). No
@@ -187,6 +189,9 @@ class Surface:
         options = {"domain": stored_domain(domain), "seam": seam, "method": parameterization}
         if corners is not None:
             options["cones"] = corners
+        inside = [int(v) for v in off_seam] if domain.has_boundary else []
+        if inside:
+            options["off_seam"] = inside
         if repairs != NO_DECISION:
             options["repairs"] = asdict(repairs)
         if parameterization == GIVEN:
@@ -211,7 +216,10 @@ class Surface:
         elif domain.has_boundary:
             if seam is not None:
                 seam = _merged(seam, mesh, name, "seam_vertices")
-            cut = cut_to_disc(mesh.vertices, mesh.faces, seam_vertices=seam, name=name)
+            around = _merged(inside, mesh, name, "off_seam")
+            cut = cut_to_disc(
+                mesh.vertices, mesh.faces, seam_vertices=seam, avoided=around, name=name
+            )
             surface = cls.from_cut(cut, mesh, **about)
         else:
             if corners is not None:

@@ -113,7 +113,10 @@ class ParamTask(Task):
             except RuntimeError as error:
                 self.console.print(f"  {name} of libigl failed: {error}")
         for name, uv in maps.items():
-            result.metrics[name] = planar_metrics(surface.vertices, surface.faces, uv)
+            found = planar_metrics(surface.vertices, surface.faces, uv)
+            result.metrics[name] = found
+            if name != "nsm":  # the others are not repaired
+                found["flipped_before_repair_percent"] = found["flipped_percent"]
         result.metrics["nsm"].update(result.certificate)
         if self.trained is not None:
             result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(

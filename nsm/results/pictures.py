@@ -165,13 +165,17 @@ def checked(uv: np.ndarray) -> Callable[[Blend], np.ndarray]:
 def panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
     """A figure of pictures with their titles, in rows of equal length."""
     columns = len(rows[0])
-    figure = Figure(figsize=(5.5 * columns + 0.6, 5.5 * len(rows)), dpi=120)
+    lines = max(title.count("\n") + 1 for row in rows for _, title in row)
+    side, above = 5.1, 0.2 + 0.2 * lines  # inches of a picture, and of the titles above a row
+    height = len(rows) * (side + above) + 0.05
+    figure = Figure(figsize=(5.5 * columns + 0.6, height), dpi=120)
     for k, (image, title) in enumerate(panel for row in rows for panel in row):
         axes = figure.add_subplot(len(rows), columns, k + 1)
         axes.imshow(image, interpolation="antialiased")
         axes.set_title(title)
         axes.set_axis_off()
-    figure.subplots_adjust(left=0.01, right=0.9, top=0.93, bottom=0.01, wspace=0.02, hspace=0.02)
+    edges = {"left": 0.01, "right": 0.9, "top": 1 - above / height, "bottom": 0.05 / height}
+    figure.subplots_adjust(**edges, wspace=0.02, hspace=above / side)
     return figure
 
 

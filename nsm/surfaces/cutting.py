@@ -20,6 +20,7 @@ from nsm.surfaces import topology
 
 FARTHEST_POINTS = 5
 _SEAM_KEY = "surface.seam_vertices"
+_DETOUR = 1000.0  # how many times its length an edge may cost to keep the seam off its ends
 # A boundary loop shorter than this times the square root of the area (a disc: 3.5, a hemisphere:
 # 2.5) is a small hole in an almost closed surface: stretching it over the whole boundary of the
 # domain would distort more than a longer seam.
@@ -65,9 +66,18 @@ def _seam_error(name: str, kind: str, reason: str) -> NsmError:
 
 
 class _Graph:
-    """The edge graph of a mesh, with each boundary loop contracted to one node."""
+    """The edge graph of a mesh, with each boundary loop contracted to one node.
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, edges: topology.Edges) -> None:
+    Edges at ``avoided`` vertices count as longer than they are.
+    """
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        edges: topology.Edges,
+        avoided: Sequence[int] = (),
+    ) -> None:
         self.loops = topology.boundary_loops(faces)
         self.node = np.arange(len(vertices))
         for loop in self.loops:
@@ -75,6 +85,9 @@ class _Graph:
         self.ends = self.node[edges.pairs]
         pairs = edges.pairs
         self.length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+        on_loops = np.concatenate([*self.loops, np.zeros(0, dtype=np.int64)])
+        self.avoided = np.setdiff1d(np.asarray(avoided, dtype=np.int64), on_loops)
+        self.length[np.isin(pairs, self.avoided).any(axis=1)] *= _DETOUR
         # keep the shortest of parallel edges: a csr matrix would add their lengths
         low, high = self.ends.min(axis=1), self.ends.max(axis=1)
         order = np.lexsort((self.length, high, low))
@@ -117,6 +130,7 @@ def cut_to_disc(
     faces: np.ndarray,
     *,
     seam_vertices: Sequence[int] | None = None,
+    avoided: Sequence[int] = (),
     name: str = "mesh",
 ) -> Cut:
     """Cut a mesh to a disc; a disc stays uncut unless seam vertices are given.
@@ -126,6 +140,7 @@ def cut_to_disc(
         faces: (F, 3), connected, oriented and manifold.
         seam_vertices: vertices that the seam visits; by default farthest points of a closed
             surface, and of an almost closed one.
+        avoided: vertices that the seam goes around where it can; those on boundaries do not count.
         name: of the mesh, for messages.
 
     Raises:
@@ -134,7 +149,7 @@ def cut_to_disc(
             ``surface.seam_vertices``.
     """
     edges = topology.edges_of(faces)
-    graph = _Graph(vertices, faces, edges)
+    graph = _Graph(vertices, faces, edges, avoided)
     log: list[str] = []
     euler = topology.euler_characteristic(faces)
     genus = (2 - euler - len(graph.loops)) // 2
@@ -225,16 +240,19 @@ def _farthest_points(graph: _Graph, start: Sequence[int], count: int) -> list[in
     else:
         # the farthest node from any node is a tip of the shape
         distance, _ = graph.distances([int(graph.ends[0, 0])])
-        chosen = [int(_finite(distance).argmax())]
+        chosen = [int(_allowed(graph, distance).argmax())]
         distance, _ = graph.distances(chosen)
-    while len(chosen) < count and _finite(distance).max() > 0:
-        chosen.append(int(_finite(distance).argmax()))
+    while len(chosen) < count and _allowed(graph, distance).max() > 0:
+        chosen.append(int(_allowed(graph, distance).argmax()))
         distance = np.minimum(distance, graph.distances(chosen[-1:])[0])
     return chosen
 
 
-def _finite(distance: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(distance), distance, -1.0)
+def _allowed(graph: _Graph, distance: np.ndarray) -> np.ndarray:
+    """Distances (V,) of nodes that a path reaches and the seam may visit; -1 of others."""
+    result = np.where(np.isfinite(distance), distance, -1.0)
+    result[graph.avoided] = -1.0
+    return result
 
 
 def _shortest_seam(

@@ -114,6 +114,18 @@ def test_the_seam_keeps_off_landmarks_that_it_does_not_pass_through(pair):
     assert inner.sum() == len(POINTS) - 3
 
 
+def test_surfaces_cut_apart_have_all_landmarks_inside():
+    meshes = [Mesh("ball", *ball(2)), Mesh("egg", ball(3)[0] * [1.0, 1.5, 0.8], ball(3)[1])]
+    usual = [Surface.from_arrays(m.vertices, m.faces) for m in meshes]
+    # all on the seams that they would have
+    ids = [np.unique(s.source_vertex[s.seam_pairs])[::3][:6] for s in usual]
+    surfaces = prepare_jointly(meshes, ids, seam="own", cache=False)
+    matched = matched_landmarks(surfaces, ids)
+    assert matched.on_boundary == 0 and list(matched.numbers) == list(range(6))
+    for surface, on_seam in zip(surfaces, ids, strict=True):
+        assert not np.isin(on_seam, surface.source_vertex[surface.seam_pairs]).any()
+
+
 def test_the_best_of_several_seams_is_taken(pair):
     meshes, ids = pair
     surfaces = prepare_jointly(meshes, ids, cache=False)

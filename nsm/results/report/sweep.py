@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
@@ -32,7 +32,12 @@ _SIDE = 420
 # of the table that is printed; the file has all figures
 _PRINTED = {
     "overfit": ("rms_percent", "normal_error_mean_degrees", "normal_variation_error_degrees"),
-    "": ("symmetric_dirichlet_median", "singular_value_ratio_median", "flipped_percent"),
+    "": (
+        "symmetric_dirichlet_median",
+        "singular_value_ratio_median",
+        "flipped_before_repair_percent",
+        "flipped_percent",
+    ),
 }
 _Panels = list[tuple[np.ndarray, str]]
 
@@ -84,7 +89,8 @@ def _write_table(file: Path, runs: Sequence[Run], names: Sequence[str]) -> None:
 def _table(runs: Sequence[Run], names: Sequence[str]) -> Table:
     chosen = [_PRINTED.get(run.task, _PRINTED[""]) for run in runs]
     keys = [k for k in dict.fromkeys(sum(chosen, ())) if any(k in run.figures for run in runs)]
-    table = Table("job", *(" ".join(FIGURES[key]).strip() for key in keys))
+    # names of jobs are not cut short: the ends tell them apart
+    table = Table(Column("job", overflow="fold"), *(" ".join(FIGURES[key]).strip() for key in keys))
     groups = over_seeds(runs)
     grouped = {number: group for group in groups for number in group.runs}
     for number, (run, name) in list(enumerate(zip(runs, names, strict=True)))[:_LINES]:
