@@ -19,9 +19,9 @@ from nsm.correspondence.proposal import (
     LARGEST_SCORE,
     LEAST_MARGIN,
     Hypothesis,
-    compared,
     hypotheses,
 )
+from nsm.correspondence.scores import compared
 
 _LEAST = 4  # landmarks, for common cones
 _KEPT = 5
