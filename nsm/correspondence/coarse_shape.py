@@ -17,7 +17,7 @@ _TIPS = 8
 _SAMPLES = 64
 _MOST = 9  # tips and given landmarks
 _AROUND = 0.3  # a tip's neighbourhood, over √area
-_LEVEL = 0.03  # mean distances that differ less are alike, over √area
+_LEVEL = 0.02  # mean distances that differ less are alike, over √area
 _NEAR = 0.15  # of a tip to a landmark that is given, over √area
 
 

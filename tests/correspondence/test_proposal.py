@@ -165,7 +165,7 @@ def test_a_limb_that_ends_elsewhere_is_drawn_to_its_place(pair):
         if np.array_equal(np.abs(b), np.eye(2)) and not c.any()
     )
     astray = np.zeros((len(Sines.up_to(2).waves), 2))
-    astray[:, 0] = 0.12 * np.sin(np.arange(len(astray)))
+    astray[:, 0] = 0.3 * np.sin(np.arange(len(astray)))
     start = Candidate(one, one, table(one), matrix, shift, 2, astray, 0.0)
     before = trained([start], Round(1, 2, 0))[0]
     off = shape.distance[before.images(np.array([fifth])), fifth]
