@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
-from nsm.correspondence.mending import MENDING, mended
+from nsm.correspondence.mending import MENDING, left_apart, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
 
@@ -28,12 +28,19 @@ class Hypothesis:
             tips that the map brings near to each other; cones of the orbifold that are no tips,
             only where the others are fewer than four.
         score: of the coarse map; lower is better.
+        whole: whether the map leaves no tips of both shapes apart that could correspond.
         candidate: the coarse map.
     """
 
     vertices: np.ndarray
     score: float
+    whole: bool
     candidate: Candidate
+
+    @property
+    def good(self) -> bool:
+        """Whether the map may be right, were there no other."""
+        return self.whole and self.score < LARGEST_SCORE
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ class Proposal:
     @property
     def sure(self) -> bool:
         """Whether the first is far ahead of the second, and good in itself."""
-        return self.margin > LEAST_MARGIN and self.hypotheses[0].score < LARGEST_SCORE
+        return self.margin > LEAST_MARGIN and self.hypotheses[0].good
 
 
 def proposed(
@@ -93,7 +100,10 @@ def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:
 def _hypothesis(candidate: Candidate) -> Hypothesis:
     pairs = _matched_tips(candidate)
     ids = candidate.source.shape.ids[pairs[:, 0]], candidate.target.shape.ids[pairs[:, 1]]
-    return Hypothesis(np.stack(ids, axis=1), score(candidate), candidate)
+    left = left_apart(candidate)
+    apart = candidate.target.shape.distance[candidate.images(left[:, 0]), left[:, 1]]
+    whole = bool((apart < _NEAR).all())
+    return Hypothesis(np.stack(ids, axis=1), score(candidate), whole, candidate)
 
 
 def _matched_tips(candidate: Candidate) -> np.ndarray:
