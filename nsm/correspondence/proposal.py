@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
-from nsm.correspondence.mending import MENDING, left_apart, mended
+from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
 
@@ -28,7 +28,7 @@ class Hypothesis:
             tips that the map brings near to each other; cones of the orbifold that are no tips,
             only where the others are fewer than four.
         score: of the coarse map; lower is better.
-        whole: whether the map leaves no tips of both shapes apart that could correspond.
+        whole: whether all tips of one shape go to tips of the other.
         candidate: the coarse map.
     """
 
@@ -100,30 +100,34 @@ def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:
 def _hypothesis(candidate: Candidate) -> Hypothesis:
     pairs = _matched_tips(candidate)
     ids = candidate.source.shape.ids[pairs[:, 0]], candidate.target.shape.ids[pairs[:, 1]]
-    left = left_apart(candidate)
-    apart = candidate.target.shape.distance[candidate.images(left[:, 0]), left[:, 1]]
-    whole = bool((apart < _NEAR).all())
+    fewer = min(len(candidate.source.shape.peaks()), len(candidate.target.shape.peaks()))
+    whole = len(_tips_brought_together(candidate)) == fewer
     return Hypothesis(np.stack(ids, axis=1), score(candidate), whole, candidate)
 
 
 def _matched_tips(candidate: Candidate) -> np.ndarray:
-    """Vertices (L, 2) of the coarse shapes: given landmarks; tips whose images are mutually
-    nearest; other cones, up to four in all. None is near a given landmark, which says the same."""
+    """Vertices (L, 2) of the coarse shapes: given landmarks; tips that are brought together; other
+    cones, up to four in all. None is near a given landmark, which says the same."""
+    pairs = _away(candidate, _tips_brought_together(candidate))
+    pairs = np.concatenate([fixed_pairs(candidate), pairs])
+    cones = candidate.cones()
+    others = _away(candidate, cones[~np.isin(cones[:, 0], pairs[:, 0])])
+    return np.concatenate([pairs, others[: max(_LEAST - len(pairs), 0)]])
+
+
+def _tips_brought_together(candidate: Candidate) -> np.ndarray:
+    """Tips (L, 2) at the cones of both, then others whose images are mutually nearest."""
     source, target = candidate.source.shape, candidate.target.shape
     ours, theirs, cones = source.peaks(), target.peaks(), candidate.cones()
-    tips = np.isin(cones[:, 0], ours) & np.isin(cones[:, 1], theirs)
-    pairs = cones[tips]
+    pairs = cones[np.isin(cones[:, 0], ours) & np.isin(cones[:, 1], theirs)]
     ours, theirs = np.setdiff1d(ours, cones[:, 0]), np.setdiff1d(theirs, cones[:, 1])
-    if len(ours) and len(theirs):
-        apart = target.distance[np.ix_(candidate.images(ours), theirs)]
-        nearest = apart.argmin(axis=1)
-        rows = np.arange(len(ours))
-        mutual = (apart.argmin(axis=0)[nearest] == rows) & (apart[rows, nearest] < _NEAR)
-        more = np.stack([ours, theirs[nearest]], axis=1)[mutual]
-        pairs = np.concatenate([pairs, more])
-    pairs = np.concatenate([fixed_pairs(candidate), _away(candidate, pairs)])
-    others = _away(candidate, cones[~tips])
-    return np.concatenate([pairs, others[: max(_LEAST - len(pairs), 0)]])
+    if not len(ours) or not len(theirs):
+        return pairs
+    apart = target.distance[np.ix_(candidate.images(ours), theirs)]
+    nearest = apart.argmin(axis=1)
+    rows = np.arange(len(ours))
+    mutual = (apart.argmin(axis=0)[nearest] == rows) & (apart[rows, nearest] < _NEAR)
+    return np.concatenate([pairs, np.stack([ours, theirs[nearest]], axis=1)[mutual]])
 
 
 def _away(candidate: Candidate, pairs: np.ndarray) -> np.ndarray:
