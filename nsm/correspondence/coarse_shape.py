@@ -16,6 +16,8 @@ _FACES = 1000
 _TIPS = 8
 _SAMPLES = 64
 _MOST = 9  # tips and given landmarks
+_AROUND = 0.3  # a tip's neighbourhood, over √area
+_LEVEL = 0.02  # mean distances that differ less are alike, over √area
 _NEAR = 0.15  # of a tip to a landmark that is given, over √area
 
 
@@ -47,6 +49,12 @@ class CoarseShape:
     def fixed(self) -> np.ndarray:
         """The vertices (given,) of landmarks that were given."""
         return self.tips[: self.given]
+
+    def peaks(self) -> np.ndarray:
+        """The tips from which the mean distance falls all around; others lie between limbs."""
+        around = self.distance[self.tips] < _AROUND
+        height = np.where(around, self.mean_distance, 0.0).max(axis=1)
+        return self.tips[self.mean_distance[self.tips] > height - _LEVEL]
 
     def spread_tips(self, count: int) -> np.ndarray:
         """Numbers of up to ``count`` tips that are far from each other."""

@@ -16,12 +16,11 @@ import numpy as np
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.layouts import quick_scores
 from nsm.correspondence.proposal import (
-    LARGEST_SCORE,
     LEAST_MARGIN,
     Hypothesis,
-    compared,
     hypotheses,
 )
+from nsm.correspondence.scores import compared
 
 _LEAST = 4  # landmarks, for common cones
 _KEPT = 5
@@ -90,7 +89,7 @@ def proposed_for_all(
         [(best + rise) / len(others) for rise in (0.0, *(r for r, _ in changed[: _KEPT - 1]))],
         float(margin),
         len(fixed),
-        bool(margin > LEAST_MARGIN and all(own[i][n] < LARGEST_SCORE for i, n in chosen.items())),
+        bool(margin > LEAST_MARGIN and all(found[i][n].good for i, n in chosen.items())),
     )
 
 

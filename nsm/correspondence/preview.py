@@ -8,7 +8,7 @@ import numpy as np
 
 from nsm.correspondence.coarse_shape import coarse_shape
 from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
-from nsm.correspondence.search import Candidate, Round, trained
+from nsm.correspondence.search import NOTHING, Candidate, Round, trained
 from nsm.errors import NsmError
 
 _ROUND = Round(8, 8, 60)
@@ -79,7 +79,7 @@ def previewed(
     ]
     wanted = np.stack([s.tips[best], t.tips[best]], axis=1)
     starts = [c for c in starts if np.array_equal(c.cones(), wanted)]
-    held = np.stack([s.tips, t.tips], axis=1) if drawn else None
+    held = np.stack([s.tips, t.tips], axis=1) if drawn else NOTHING
     found = trained(starts, _ROUND, held)
     off = [t.distance[c.images(s.tips), t.tips] for c in found]
     # the isotopy class that other landmarks tell, and distortion

@@ -44,7 +44,7 @@ class Sines:
         return cls(k, 1 / np.sqrt(1 + (k**2).sum(axis=1)))
 
     def basis(self, x: np.ndarray) -> np.ndarray:
-        """Values and both derivatives (3, N, K) at points (N, 2) of Ω."""
+        """Values and both derivatives (3, ..., K) at points (..., 2) of Ω."""
         phase = np.pi * x @ self.waves.T
         sine, cosine = np.sin(phase) * self.scale, np.pi * np.cos(phase) * self.scale
         return np.stack([sine, cosine * self.waves[:, 0], cosine * self.waves[:, 1]])
@@ -54,16 +54,16 @@ class Anchors(NamedTuple):
     """Points that maps of a batch draw together.
 
     Attributes:
-        points: (G, 2) of the source's Ω.
+        points: (H, G, 2) of the source's Ω.
         places: (H, G, 2) of each map's target, in any lift.
         shapes: (H, 2, 2) of each target's plane: distances are those of ``shape @ x``.
-        weight: of the squared distance, beside the energy.
+        weights: (H, G) of the squared distances, beside the energy.
     """
 
-    points: np.ndarray
-    places: np.ndarray
-    shapes: np.ndarray
-    weight: float
+    points: Tensor
+    places: Tensor
+    shapes: Tensor
+    weights: Tensor
 
 
 class Batch:
@@ -99,30 +99,28 @@ class Batch:
         self.log_metric = tensor(np.stack([t.log_metric for t in tables]))
         self.number = torch.as_tensor(number)
         self.matrices, self.shifts = tensor(matrices), tensor(shifts)
-        self.weight = 0.0 if anchors is None else anchors.weight
+        self.anchors = anchors
         if anchors is not None:
-            self.anchor_basis = tensor(Sines.up_to(largest).basis(anchors.points)[0])
-            self.anchors, self.places = tensor(anchors.points), tensor(anchors.places)
-            self.shapes = tensor(anchors.shapes)
+            self.anchor_basis = tensor(Sines.up_to(largest).basis(anchors.points.numpy())[0])
 
     def losses(self, amplitudes: Tensor) -> Tensor:
         """The energies (H,), and what anchors add to them."""
         loss = self.energies(amplitudes)
-        if self.weight:
-            loss = loss + self.weight * self.gaps(amplitudes)
+        if self.anchors is not None:
+            loss = loss + (self.anchors.weights * self.gaps(amplitudes, self.anchors)).sum(dim=1)
         return loss
 
-    def gaps(self, amplitudes: Tensor) -> Tensor:
-        """Sum (H,) of the squared distances of anchors' images to the nearest lifts of places."""
-        basis = self.anchor_basis[:, : amplitudes.shape[1]]
-        h = self.anchors + torch.einsum("gk,hkc->hgc", basis, amplitudes)
+    def gaps(self, amplitudes: Tensor, anchors: Anchors) -> Tensor:
+        """Squared distances (H, G) of anchors' images to the nearest lifts of places."""
+        basis = self.anchor_basis[:, :, : amplitudes.shape[1]]
+        h = anchors.points + torch.einsum("hgk,hkc->hgc", basis, amplitudes)
         image = torch.einsum("hij,hgj->hgi", self.matrices, h) + self.shifts[:, None]
         squared = []
         for sign in (1, -1):
-            off = image - sign * self.places
+            off = image - sign * anchors.places
             off = off - 2 * torch.round(off.detach() / 2)
-            squared.append((torch.einsum("hij,hgj->hgi", self.shapes, off) ** 2).sum(dim=-1))
-        return torch.minimum(*squared).sum(dim=-1)
+            squared.append((torch.einsum("hij,hgj->hgi", anchors.shapes, off) ** 2).sum(dim=-1))
+        return torch.minimum(*squared)
 
     def energies(self, amplitudes: Tensor) -> Tensor:
         """Mean symmetric Dirichlet energy (H,) of maps with amplitudes (H, K, 2)."""

@@ -24,7 +24,11 @@ from nsm.errors import NsmError
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
-_HOLD = 50.0  # weight of the squared distance, over the area, by which a map misses a landmark
+# weights of the squared distance, over the area, by which a map misses landmarks, and tips
+_HOLD, _DRAW = 50.0, 1000.0
+
+
+NOTHING = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -114,10 +118,15 @@ def candidates(
             kind="no_proposal",
             key="landmarks",
         )
-    held = np.stack([source.fixed, target.fixed], axis=1)
+    held = fixed_pairs(found[0])
     for one in rounds:
         found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held)
     return sorted(found, key=lambda c: c.cost)
+
+
+def fixed_pairs(candidate: Candidate) -> np.ndarray:
+    """Vertices (G, 2) of landmarks that were given."""
+    return np.stack([candidate.source.shape.fixed, candidate.target.shape.fixed], axis=1)
 
 
 def missed(candidate: Candidate) -> np.ndarray:
@@ -200,21 +209,26 @@ def changes(
 
 
 def trained(
-    found: Sequence[Candidate], one: Round, held: np.ndarray | None = None
+    found: Sequence[Candidate],
+    one: Round,
+    held: np.ndarray = NOTHING,
+    drawn: Sequence[np.ndarray] | None = None,
 ) -> list[Candidate]:
     """The candidates after a round of trainings; those of one source's layout in one batch.
 
     Args:
         found: the candidates.
         one: the round.
-        held: (G, 2) vertices of source and target that are drawn together; none by default.
+        held: (G, 2) vertices of source and target that all maps take near to one another.
+        drawn: (L, 2) the same of each candidate, with more force; none by default.
     """
     waves = len(Sines.up_to(one.largest).waves)
-    by_source: dict[int, list[Candidate]] = {}
-    for candidate in found:
-        by_source.setdefault(id(candidate.source), []).append(candidate)
-    result = []
-    for group_ in by_source.values():
+    by_source: dict[int, list[int]] = {}
+    for k, candidate in enumerate(found):
+        by_source.setdefault(id(candidate.source), []).append(k)
+    result = list(found)
+    for members in by_source.values():
+        group_ = [found[k] for k in members]
         tables = list({id(c.table): c.table for c in group_}.values())
         number = {id(t): k for k, t in enumerate(tables)}
         batch = Batch(
@@ -224,30 +238,37 @@ def trained(
             np.stack([c.matrix for c in group_]),
             np.stack([c.shift for c in group_]),
             one.largest,
-            _anchors(group_[0].source, group_, held),
+            _anchors(group_, held, [NOTHING if drawn is None else drawn[k] for k in members]),
         )
         start = torch.zeros(len(group_), waves, 2)
         for k, candidate in enumerate(group_):  # few waves come first among many
             start[k, : len(candidate.amplitudes)] = torch.as_tensor(candidate.amplitudes)
         amplitudes, _ = refined(batch, start, one.steps)
-        energies, losses = batch.energies(amplitudes), batch.losses(amplitudes)
-        result += [
-            replace(c, largest=one.largest, amplitudes=a, energy=e, cost=cost)
-            for c, a, e, cost in zip(
-                group_,
-                amplitudes.numpy().astype(float),
-                energies.tolist(),
-                losses.tolist(),
-                strict=True,
+        ends = zip(amplitudes, batch.energies(amplitudes), batch.losses(amplitudes), strict=True)
+        for k, (values, energy, loss) in zip(members, ends, strict=True):
+            result[k] = replace(
+                found[k],
+                largest=one.largest,
+                amplitudes=values.numpy().astype(float),
+                energy=float(energy),
+                cost=float(loss),
             )
-        ]
     return result
 
 
-def _anchors(source: Layout, found: Sequence[Candidate], held: np.ndarray | None) -> Anchors | None:
-    if held is None or not len(held):
+def _anchors(
+    found: Sequence[Candidate], held: np.ndarray, drawn: Sequence[np.ndarray]
+) -> Anchors | None:
+    count = len(held) + max(map(len, drawn))
+    if not count:
         return None
-    targets = [candidate.target.embedding for candidate in found]
-    shapes = [t.lattice / SIDE / np.sqrt(t.area) for t in targets]
-    places = [t.uv[held[:, 1]] for t in targets]
-    return Anchors(source.embedding.uv[held[:, 0]], np.stack(places), np.stack(shapes), _HOLD)
+    points, places = np.zeros((2, len(found), count, 2))
+    weights = np.zeros((len(found), count))
+    shapes = np.zeros((len(found), 2, 2))
+    for k, (candidate, more) in enumerate(zip(found, drawn, strict=True)):
+        ours, theirs = candidate.source.embedding, candidate.target.embedding
+        ids = np.concatenate([held, more])
+        points[k, : len(ids)], places[k, : len(ids)] = ours.uv[ids[:, 0]], theirs.uv[ids[:, 1]]
+        weights[k, : len(held)], weights[k, len(held) : len(ids)] = _HOLD, _DRAW
+        shapes[k] = theirs.lattice / SIDE / np.sqrt(theirs.area)
+    return Anchors(*(torch.as_tensor(a).float() for a in (points, places, shapes, weights)))
