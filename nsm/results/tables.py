@@ -41,7 +41,7 @@ _MAP_COLUMNS = {
     "boundary_self_intersections": "overlaps",
 }
 # what a method of :class:`nsm.results.Parameterization` is called in the table
-_METHODS = {"domain": "before: domain Ω"}
+_METHODS = {"domain": "before: domain Ω", "given": "before: given UV"}
 
 
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
