@@ -32,7 +32,6 @@ from nsm.results import (
     distortion_picture,
     export_mesh,
     export_surface,
-    isotopy_table,
     map_image,
     mean_log_distortion,
     morph_pictures,
@@ -109,7 +108,8 @@ class PairMapTask(Task):
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
             self.alignments = alignments(phi.surface, psi.surface, common)
-            self.console.print(isotopy_table(self.alignments[:_CLASSES_SHOWN]))
+            scores = ", ".join(f"{one.score:.3f}" for one in self.alignments[:_CLASSES_SHOWN])
+            self.console.print(f"likely isotopy classes, best first: scores {scores}")
 
     @property
     def title(self) -> str:
@@ -229,7 +229,13 @@ class PairMapTask(Task):
         if self.domain.has_boundary:
             return said
         classes = [
-            {"matrix": a.matrix.astype(int).tolist(), "shift": a.shift.tolist(), "score": a.score}
+            {
+                "matrix": a.matrix.astype(int).tolist(),
+                "shift": a.shift.tolist(),
+                "mean_log_distortion": a.distortion,
+                "landmarks_missed": a.miss,
+                "score": a.score,
+            }
             for a in self.alignments[:_CLASSES_SHOWN]
         ]
         return {**said, "isotopy_class": self.config.isotopy_class, "isotopy_classes": classes}
