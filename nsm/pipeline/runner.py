@@ -24,6 +24,7 @@ from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
 from nsm.results.files import as_json
 from nsm.results.loggers import check_packages, log_figures, loggers_of
+from nsm.results.render import axis_of, upright
 from nsm.run_directories import is_temporary
 from nsm.stages import stage
 from nsm.tasks.ensemble import Ensemble
@@ -73,7 +74,7 @@ def run_task(
         NsmError: an input, setting or run folder that cannot be used.
     """
     started = time.monotonic()
-    with process_state():
+    with process_state(), upright(axis_of(config)):
         console = Console(highlight=False, markup=False, quiet=quiet)
         task = make_task(config, console)
         check_device(config)

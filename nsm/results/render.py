@@ -6,7 +6,10 @@ triangle and sort them wrongly; a picture during training may take a fraction of
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -25,6 +28,24 @@ UP_AXES = {
     for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
     for k, axis in enumerate("yzx")
 }
+
+_up: ContextVar[str] = ContextVar("up", default="y")
+
+
+@contextmanager
+def upright(axis: str) -> Iterator[None]:
+    """Within the block, views show an axis of :data:`UP_AXES` upwards."""
+    token = _up.set(axis)
+    try:
+        yield
+    finally:
+        _up.reset(token)
+
+
+def axis_of(settings: Mapping[str, Any]) -> str:
+    """The axis that settings have upwards; y where they, perhaps a stranger's, name none."""
+    axis = settings.get("up")
+    return axis if isinstance(axis, str) and axis in UP_AXES else "y"
 
 
 def frames_of(vertices: np.ndarray) -> dict[str, np.ndarray]:
@@ -132,11 +153,12 @@ class View:
     Args:
         reference: vertices (V, 3) that fill the picture.
         size: side of the picture in pixels.
-        frame: rows right, up, towards the viewer (3, 3); by default :func:`view_frame`.
+        frame: rows right, up, towards the viewer (3, 3); by default :func:`view_frame`, with the
+            axis upwards that :func:`upright` names.
     """
 
     def __init__(self, reference: np.ndarray, size: int, frame: np.ndarray | None = None) -> None:
-        self.frame = view_frame(reference) if frame is None else frame
+        self.frame = frames_of(reference)[_up.get()] if frame is None else frame
         turned = reference @ self.frame.T
         self.center = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
         self.half = 0.53 * float(np.ptp(turned[:, :2], axis=0).max())

@@ -13,11 +13,14 @@ from PIL import Image
 from tiny import results
 from torch import nn
 
+from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
 from nsm.maps import NeuralMap
 from nsm.maps.encodings import RandomFourierFeatures
+from nsm.pipeline import runner
+from nsm.pipeline.task import Task
 from nsm.results import (
     NeuralSurface,
     atomic_write,
@@ -38,7 +41,7 @@ from nsm.results.evolution import extend_strip
 from nsm.results.files import as_json
 from nsm.results.pair_pictures import normals_picture
 from nsm.results.pictures import neural_normals
-from nsm.results.render import View, rasterise, vertex_normals
+from nsm.results.render import UP_AXES, View, rasterise, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.surfaces.shapes import ring_mesh
 
@@ -399,3 +402,24 @@ def test_pictures_of_normals_and_of_a_cycle_are_drawn(tmp_path):
     for name in ("normals.png", "cycle.png"):
         picture = np.asarray(Image.open(tmp_path / name).convert("RGB"), dtype=float)
         assert picture.std() > 20  # something is on it
+
+
+@pytest.mark.parametrize("axis", UP_AXES)
+def test_pictures_of_a_run_have_its_axis_upwards(axis, tmp_path, monkeypatch):
+    reference = np.random.default_rng(0).normal(size=(20, 3)) * [3, 4, 5]
+    frames = []
+
+    class Drawing(Task):
+        def choose_domain(self, given):
+            frames.append(View(reference, 8).frame)
+            raise StopIteration
+
+    task = Drawing()
+    monkeypatch.setattr(runner, "make_task", lambda config, console: task)
+    with pytest.raises(StopIteration):
+        runner.run_task(compose_config([f"up={axis}"]), tmp_path)
+    sign = -1 if axis[0] == "-" else 1
+    up = sign * frames[0][1]["xyz".index(axis[-1])]
+    assert up > 0.9
+    after = View(reference, 8).frame[1]
+    assert after[1] > 0.9  # the caller's views are as they were
