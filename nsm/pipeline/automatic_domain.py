@@ -10,6 +10,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Automatic, Domain, Surface, domain
+from nsm.domains.joint_preparation import check_common_topology
+from nsm.domains.orbifold.domain import ClosedDomain
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, build_analytic
@@ -42,19 +44,26 @@ def choose_domain(
         closed: whether the task can do without a boundary.
 
     Raises:
-        NsmError: a mesh that cannot be read.
+        NsmError: a mesh that cannot be read; ``wrong_topology``: of another genus than a closed
+            surface that is ready or analytic, or with a boundary.
     """
     found: Domain | None = None
-    topologies = []
+    topologies, names = [], []
     for given in inputs:
         own, topology = _told_by(given, config)
         found = found or own
-        topologies += [] if topology is None else [topology]
+        if topology is not None:
+            topologies.append(topology)
+            names.append(Path(given).stem if isinstance(given, (str, Path)) else "the mesh")
     if found is None:
         chosen = made(config.domain).chosen(topologies) if topologies else domain("disc")
         found = chosen if closed and _suits(config, chosen) else domain("disc")
         if not found.has_boundary:
             console.print(f"domain={found}: closed surfaces of genus {topologies[0][0]}, no seam")
+    elif isinstance(found, ClosedDomain):
+        wanted = (0 if found.even else 1, 0)
+        ready = f"the closed surface on the {found}"
+        check_common_topology([ready, *names], [wanted, *topologies])
     config.domain = found.config
     return found
 

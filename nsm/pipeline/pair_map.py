@@ -17,6 +17,7 @@ from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
+from nsm.pipeline.landmark_check import warn_of_landmarks
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
     neural_surfaces,
@@ -44,6 +45,7 @@ from nsm.results import (
     write_reliability,
 )
 from nsm.results.file_faces import faces_of_file
+from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
@@ -94,6 +96,7 @@ class PairMapTask(Task):
         shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
+        warn_of_landmarks(shapes, ids, self.console)
         self.attributes = read_attributes(settings["attributes"], counts)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
         self.use(phi, psi, ids)
@@ -255,6 +258,10 @@ class PairMapTask(Task):
         if self.textures is not None:
             for line in write_textured(self.textures, folder, result, self.config.texture_size):
                 self.console.print(line)
+
+    def write_inputs(self, folder: Path) -> None:
+        if len(self.ids[0]):
+            landmarks_picture(folder / "landmarks.png", [self.surface, self.psi.surface], self.ids)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface

@@ -113,6 +113,9 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
     """
     with stage(task.console, f"{task.title}: network and samples"):
         module, data = built(task), task.build_data()
+        if task.config.artefacts:
+            run.folder.mkdir(parents=True, exist_ok=True)
+            task.write_inputs(run.folder)
     trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
     while task.begin_again(module):
         # first this, then the new settings: a run that is killed between does the same again

@@ -164,6 +164,13 @@ class View:
         self.half = 0.53 * float(np.ptp(turned[:, :2], axis=0).max())
         self.size = size
 
+    def pixels(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (V, 3) are in a picture, (V, 2) to the right and downwards, and their depth
+        (V,), larger is nearer."""
+        turned = vertices @ self.frame.T
+        flat = (turned[:, :2] - self.center[:2]) / self.half
+        return np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) * 0.5 * self.size, turned[:, 2]
+
     def draw(
         self,
         vertices: np.ndarray,
@@ -180,17 +187,15 @@ class View:
             seam_pairs: (T, 2) vertices that were one before the cut, which share a normal.
         """
         fine = self.size * _SUPERSAMPLING
-        turned = vertices @ self.frame.T
-        flat = (turned[:, :2] - self.center[:2]) / self.half
-        xy = np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) * 0.5 * fine
-        pixel, face, weights = rasterise(xy, turned[:, 2], faces, fine)
+        xy, depth = self.pixels(vertices)
+        pixel, face, weights = rasterise(xy * _SUPERSAMPLING, depth, faces, fine)
         corners = faces[face]
 
         def blend(values: np.ndarray) -> np.ndarray:
             return (weights[:, :, None] * values[corners]).sum(axis=1)
 
         base = colours(blend)
-        normal = blend(vertex_normals(turned, faces, seam_pairs))
+        normal = blend(vertex_normals(vertices @ self.frame.T, faces, seam_pairs))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
         facing = np.where(normal[:, 2:] < 0, -normal, normal)
         lit = 0.38 + 0.62 * np.clip(facing @ _LIGHT, 0, 1)
