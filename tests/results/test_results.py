@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from tiny import results
+from tiny import dome, results
 from torch import nn
 
 from nsm.config import compose_config
@@ -39,6 +39,7 @@ from nsm.results import (
 from nsm.results.collection_pictures import cycle_picture
 from nsm.results.evolution import extend_strip
 from nsm.results.files import as_json
+from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.pair_pictures import normals_picture
 from nsm.results.pictures import neural_normals
 from nsm.results.render import UP_AXES, View, rasterise, vertex_normals
@@ -423,3 +424,14 @@ def test_pictures_of_a_run_have_its_axis_upwards(axis, tmp_path, monkeypatch):
     assert up > 0.9
     after = View(reference, 8).frame[1]
     assert after[1] > 0.9  # the caller's views are as they were
+
+
+def test_landmarks_are_drawn_with_their_numbers(tmp_path):
+    surfaces = [dome(0.2, 4), dome(0.4, 4)]
+    files = [tmp_path / f"{k}.png" for k in range(2)]
+    ids = np.array([0, 10, -1, 30])
+    landmarks_picture(files[0], surfaces, [ids, ids])
+    landmarks_picture(files[1], surfaces, [np.full(4, -1)] * 2)
+    with_marks, without = (np.asarray(Image.open(f).convert("RGB"), dtype=int) for f in files)
+    assert np.ptp(without, axis=2).max() < 10  # grey
+    assert (np.ptp(with_marks, axis=2) > 100).sum() > 50  # spheres
