@@ -236,10 +236,12 @@ def _compare(folders: Sequence[Path]) -> None:
     """Leave the figure and the table of a sweep's jobs in its folder, and print the table."""
     console = Console(highlight=False, markup=False)
     with stage(console, "figure of the sweep"):
+        from nsm.results.render import axis_of, upright
         from nsm.results.report.sweep import write_sweep
 
-        artefacts = read_config(folders[0] / "config.yaml").get("artefacts", True)
-        table = write_sweep(folders[0].parent, figure=bool(artefacts))
+        config = read_config(folders[0] / "config.yaml")
+        with upright(axis_of(config)):
+            table = write_sweep(folders[0].parent, figure=bool(config.get("artefacts", True)))
     if table is not None:
         console.print(table)
 

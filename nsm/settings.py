@@ -509,6 +509,8 @@ class Settings:
             trust=[mypackage].
         seed: of the initial network and the samples: the same seed gives the same result.
         artefacts: leave pictures and exported meshes in the run folder.
+        up: the axis of the mesh files that points up in pictures, and at first in the report and in
+            the viewer.
         resume: the folder of an interrupted run, which goes on.
     """
 
@@ -533,6 +535,7 @@ class Settings:
     trust: list[str] = field(default_factory=list)
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0  # the largest that numpy takes
     artefacts: bool = True
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "y"
     resume: str | None = None
 
 

@@ -37,6 +37,24 @@ def check_tensors(f: SurfaceMap) -> None:
     (gradient,) = torch.autograd.grad(y.sum(), x)
     np.testing.assert_allclose(gradient.numpy(), jacobian.sum(axis=1), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(f.inverse(y).detach().numpy(), f.inverse(f(p)), atol=1e-8 * size)
+    check_planar(f)
+
+
+def check_planar(f: SurfaceMap) -> None:
+    """The same of the map between the domains, in other lifts of a closed domain too."""
+    s = f.source.surface
+    uv = s.uv[s.faces].mean(axis=1)
+    if not s.domain.has_boundary:
+        uv = np.concatenate([uv, 2 - uv, uv + [2, -4]])
+    x = torch.tensor(uv, requires_grad=True)
+    y = f.planar(x)
+    np.testing.assert_allclose(y.detach().numpy(), f.planar(uv), atol=1e-9)
+    eps = 1e-7
+    for k in range(2):
+        (gradient,) = torch.autograd.grad(y[:, k].sum(), x, retain_graph=True)
+        ways = eps * np.eye(2)
+        slopes = np.stack([(f.planar(uv + e) - f.planar(uv - e))[:, k] for e in ways], axis=1)
+        np.testing.assert_allclose(gradient.numpy(), slopes / (2 * eps), rtol=1e-4, atol=1e-4)
 
 
 def check_weights(f: SurfaceMap) -> None:

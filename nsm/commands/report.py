@@ -35,9 +35,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--title", default="nsm report", help="default: %(default)s")
     parser.add_argument(
         "--up",
-        default="y",
         choices=["x", "y", "z", "-x", "-y", "-z"],
-        help="the axis of the mesh files that points up, as in --up=-y; default: %(default)s",
+        help="the axis of the mesh files that points up, as in --up=-y; default: the runs' own",
     )
     add_trust(parser)
     given = parser.parse_args(arguments)

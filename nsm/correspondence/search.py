@@ -21,6 +21,7 @@ from nsm.correspondence.refinement import Anchors, Batch, Sines, refined
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
 from nsm.errors import NsmError
+from nsm.stages import at
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
@@ -87,8 +88,8 @@ class Candidate:
         image = SIDE * group.CONES @ self.matrix.T + self.shift
         corner = np.mod(np.rint(image).astype(int), 2)
         wanted = np.rint(SIDE * group.CONES).astype(int)
-        at = [int(np.flatnonzero((wanted == c).all(axis=1))[0]) for c in corner]
-        return np.stack([self.source.tips, self.target.tips[at]], axis=1)
+        cones = [int(np.flatnonzero((wanted == c).all(axis=1))[0]) for c in corner]
+        return np.stack([self.source.tips, self.target.tips[cones]], axis=1)
 
 
 def candidates(
@@ -102,6 +103,7 @@ def candidates(
     Raises:
         NsmError: ``no_proposal``: no map meets the landmarks that are given.
     """
+    at("layouts")
     sets, scores = quick_scores(source)
     ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]])
     theirs = _laid_out(target, _similar_sets(ours, target))
@@ -119,7 +121,8 @@ def candidates(
             key="landmarks",
         )
     held = fixed_pairs(found[0])
-    for one in rounds:
+    for k, one in enumerate(rounds):
+        at("maps tried", k, len(rounds))
         found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held)
     return sorted(found, key=lambda c: c.cost)
 

@@ -49,7 +49,22 @@ def check_given(
 def cut_as_given(
     mesh: CleanMesh, faces: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[Cut, np.ndarray]:
-    """A mesh cut along the borders of its texture coordinates.
+    """As :func:`islands_as_given`, of texture coordinates that are one island.
+
+    Raises:
+        NsmError: ``unusable_uv``: several islands, or as there.
+    """
+    islands = islands_as_given(mesh, faces, uv, name)
+    if len(islands) > 1:
+        reason = f"have {len(islands)} islands; task=param flattens them one by one"
+        raise _unusable(name, reason)
+    return islands[0]
+
+
+def islands_as_given(
+    mesh: CleanMesh, faces: np.ndarray, uv: np.ndarray, name: str
+) -> list[tuple[Cut, np.ndarray]]:
+    """A mesh cut along the borders of its texture coordinates, those with most faces first.
 
     Args:
         mesh: the cleaned mesh.
@@ -58,56 +73,81 @@ def cut_as_given(
         name: of the mesh, in messages.
 
     Returns:
-        The disc, and the coordinates (V, 2) of its vertices, counter-clockwise.
+        Discs, which have the vertices of their island alone, and the coordinates (V, 2) of their
+        vertices, counter-clockwise.
 
     Raises:
-        NsmError: ``unusable_uv``: several islands, holes, flipped triangles or overlaps, or a face
+        NsmError: ``unusable_uv``: islands with holes, flipped triangles or overlaps, or a face
             that the repair changed.
     """
+    own = _at_corners(mesh, faces, uv, name)
+    edges = topology.edges_of(mesh.faces)
+    base = len(mesh.vertices)
+    seams = np.sort(uv_seams(mesh.faces, own), axis=1) @ [base, 1]
+    cut_faces, old = topology.cut_along(mesh.faces, np.isin(edges.pairs @ [base, 1], seams))
+    flat = np.empty((len(old), 2))
+    flat[cut_faces] = own
+    log = f"cut along {len(np.unique(seams))} edges, as the texture coordinates are"
+    label = topology.face_components(cut_faces)
+    islands = []
+    for k in np.argsort(-np.bincount(label), kind="stable").tolist():
+        used, number = topology.renumbered(cut_faces[label == k], len(old))
+        part = number[cut_faces[label == k]]
+        laid = _checked(flat[used], part, name)
+        both, part, inserted = split_chords(np.hstack([mesh.vertices[old[used]], laid]), part)
+        origin = np.concatenate([old[used], np.full(inserted, -1)])
+        loop = topology.boundary_loops(part)[0]
+        points = np.ascontiguousarray(both[:, :3])
+        cut = Cut(points, part, origin, seam_pairs(origin), loop, (log,))
+        islands.append((cut, np.ascontiguousarray(both[:, 3:])))
+    return islands
 
-    def unusable(reason: str) -> NsmError:
-        message = f"{name}: {_KEY}=given: the texture coordinates {reason}"
-        return NsmError(message, kind="unusable_uv", key=_KEY)
 
+def _unusable(name: str, reason: str) -> NsmError:
+    message = f"{name}: {_KEY}=given: the texture coordinates {reason}"
+    return NsmError(message, kind="unusable_uv", key=_KEY)
+
+
+def _at_corners(mesh: CleanMesh, faces: np.ndarray, uv: np.ndarray, name: str) -> np.ndarray:
+    """Texture coordinates (F, 3, 2) at the corners of the cleaned mesh's faces."""
     merged = mesh.merged[faces]
     there = np.where(merged >= 0, mesh.source_vertex[merged], -1)
     here = mesh.source_vertex[mesh.faces]
     file_face, own_face = topology.equal_faces(there, here)
     if len(own_face) < len(here):
         lost = len(here) - len(own_face)
-        raise unusable(f"of {lost} faces are lost by the repair; take slim")
+        raise _unusable(name, f"of {lost} faces are lost by the repair; take slim")
     order = np.empty(len(here), dtype=np.int64)
     order[own_face] = file_face
     corner = (here[:, :, None] == there[order][:, None, :]).argmax(axis=2)
-    own = np.take_along_axis(uv[order], corner[:, :, None], axis=1)
+    return np.take_along_axis(uv[order], corner[:, :, None], axis=1)
 
-    edges = topology.edges_of(mesh.faces)
-    base = len(mesh.vertices)
-    seams = np.sort(uv_seams(mesh.faces, own), axis=1) @ [base, 1]
-    cut_faces, old = topology.cut_along(mesh.faces, np.isin(edges.pairs @ [base, 1], seams))
-    islands = int(topology.face_components(cut_faces).max()) + 1
-    if islands > 1:
-        raise unusable(f"have {islands} islands; flatten them one by one with task=param seams=uv")
-    if not topology.is_disc(cut_faces):
-        raise unusable("have holes, so that they are no disc; cut them open, or take slim")
-    flat = np.empty((len(old), 2))
-    flat[cut_faces] = own
-    areas = signed_areas(flat, cut_faces)
+
+def _checked(flat: np.ndarray, faces: np.ndarray, name: str) -> np.ndarray:
+    """The coordinates (V, 2) of an island, counter-clockwise."""
+    if not topology.is_disc(faces):
+        reason = "have holes, so that they are no disc; cut them open, or take slim"
+        raise _unusable(name, reason)
+    areas = signed_areas(flat, faces)
     if areas.sum() < 0:  # a mirrored island
-        flat[:, 0] *= -1
+        flat = flat * [-1, 1]
         areas = -areas
     flipped = int((~(areas > 0)).sum())
     if flipped:
-        raise unusable(f"flip {flipped} of {len(areas)} triangles; mend them, or take slim")
-    crossings = boundary_self_intersections(flat, topology.boundary_loops(cut_faces)[0])
+        reason = f"flip {flipped} of {len(areas)} triangles; mend them, or take slim"
+        raise _unusable(name, reason)
+    crossings = boundary_self_intersections(flat, topology.boundary_loops(faces)[0])
     if crossings:
-        raise unusable(f"overlap: their border crosses itself {crossings} times; take slim")
-    both, cut_faces, inserted = split_chords(np.hstack([mesh.vertices[old], flat]), cut_faces)
-    origin = np.concatenate([old, np.full(inserted, -1)])
-    loop = topology.boundary_loops(cut_faces)[0]
-    log = [f"cut along {len(np.unique(seams))} edges, as the texture coordinates are"]
-    points = np.ascontiguousarray(both[:, :3])
-    return Cut(points, cut_faces, origin, seam_pairs(origin), loop, tuple(log)), both[:, 3:]
+        reason = f"overlap: their border crosses itself {crossings} times; take slim"
+        raise _unusable(name, reason)
+    return flat
+
+
+def in_units_of(domain: BoundedDomain, uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Coordinates (V, 2), counter-clockwise, scaled to the area of Ω and centred, not turned."""
+    scale = np.sqrt(domain.area / signed_areas(uv, faces).sum())
+    scaled: np.ndarray = (uv - uv.mean(axis=0)) * scale
+    return scaled
 
 
 def embedded_as_given(domain: BoundedDomain, cut: Cut, uv: np.ndarray, name: str) -> Embedding:
@@ -138,8 +178,7 @@ def embedded_as_given(domain: BoundedDomain, cut: Cut, uv: np.ndarray, name: str
             median = float(np.median(triangle_distortion(filling, vertices, cut.faces)))
             line = "texture coordinates fill the domain: kept as they are"
             return Embedding(filling, median, float("nan"), (line,))
-    scale = np.sqrt(domain.area / signed_areas(uv, cut.faces).sum())
-    plane = np.pad((uv - uv.mean(axis=0)) * scale, ((0, 0), (0, 1)))
+    plane = np.pad(in_units_of(domain, uv, cut.faces), ((0, 0), (0, 1)))
     flat = domain.embed(plane, cut.faces, name=name)
     u, _, vt = np.linalg.svd(plane[:, :2].T @ flat.uv)
     turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from nsm.domains.base import Domain, Keys
 from nsm.domains.caps import without_caps
 from nsm.domains.embedding import GIVEN, check_method
-from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given
+from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given, in_units_of
 from nsm.domains.names import bounded
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
@@ -34,7 +34,7 @@ from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
-OPTIONAL = ("lattice", "ends", "caps")
+OPTIONAL = ("lattice", "ends", "caps", "given_uv")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +66,8 @@ class Surface:
             correspond. None elsewhere.
         caps: (F,) bool, the faces of caps that close the boundaries of a part for a map into a
             whole shape (see :attr:`part`); None: there are none.
+        given_uv: (V, 2) the texture coordinates that its layout starts from, counter-clockwise,
+            scaled as a whole to the area of Ω. None without ``parameterization="given"``.
         raw: the mesh (W, 3), (G, 3) as it was given, from which a map prepares it again; None for
             an analytic surface, and for one that an older version stored.
     """
@@ -85,6 +87,7 @@ class Surface:
     lattice: np.ndarray | None = field(default=None, repr=False)
     ends: np.ndarray | None = field(default=None, repr=False)
     caps: np.ndarray | None = field(default=None, repr=False)
+    given_uv: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @classmethod
@@ -196,7 +199,7 @@ class Surface:
             options["repairs"] = asdict(repairs)
         if parameterization == GIVEN:
             given_uv = check_given(uv, faces, domain, seam, name)
-            options["uv"] = hashlib.sha256(given_uv.tobytes()).hexdigest()
+            options["given_uv"] = hashlib.sha256(given_uv.tobytes()).hexdigest()
         key = cache_.preparation_key(vertices, faces, options) if cache else ""
         stored = cache_.read(key) if cache else None
         raw = (vertices, faces)
@@ -263,6 +266,7 @@ class Surface:
             flat = domain.embed(normalised, cut.faces, **how)
         else:
             flat = embedded_as_given(bounded(domain), cut, given, name)
+            given = in_units_of(bounded(domain), given, cut.faces)
         flipped = flipped_triangles(flat.uv, cut.faces)
         crossings = boundary_self_intersections(flat.uv, cut.loop) if domain.has_boundary else 0
         if flipped or crossings:
@@ -295,6 +299,7 @@ class Surface:
             center=center,
             quality=quality,
             log=(*log, *cut.log, *flat.log),
+            given_uv=given,
         )
 
     @classmethod

@@ -13,6 +13,7 @@ from nsm.maps.multilevel_spline import MultilevelSpline
 from nsm.maps.networks import BLOCKS, NeuralMap, PlanarNetwork, build_network, build_stored
 from nsm.maps.planar import DiscMap, IdentityInitializedMap, PlanarMap, SquareMap
 from nsm.maps.spline_field import SplineField
+from nsm.maps.started import LinearInFeatures, StartedMap
 from nsm.maps.tabulated import Remembered, Tabulated
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "IdentityInitializedMap",
     "LatticeAligned",
     "LatticeSplineGrid",
+    "LinearInFeatures",
     "MultilevelSpline",
     "NeuralMap",
     "Placed",
@@ -42,8 +44,9 @@ __all__ = [
     "SplineField",
     "SplineGrid",
     "SquareMap",
-    "TorusMap",
+    "StartedMap",
     "Tabulated",
+    "TorusMap",
     "TransitionMap",
     "as_activation",
     "batched",

@@ -302,8 +302,13 @@ def build_stored(config: Mapping[str, Any], trust: Iterable[str] = ()) -> nn.Mod
     """
     check_trusted(config, trust)
     if isinstance(config.get("network"), Mapping):
-        around = {key: value for key, value in config.items() if key != "network"}
-        whole: nn.Module = made_with(around, network=build_stored(config["network"], trust))
+        inner = {
+            key: build_stored(config[key], trust)
+            for key in ("network", "start")
+            if isinstance(config.get(key), Mapping)
+        }
+        around = {key: value for key, value in config.items() if key not in inner}
+        whole: nn.Module = made_with(around, **inner)
         return whole
     parts = dict(config)
     named = {k: parts.pop(k, None) for k in ("activation", "encoding")}

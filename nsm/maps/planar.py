@@ -60,7 +60,7 @@ class IdentityInitializedMap(nn.Module):
     @property
     def config(self) -> dict[str, Any]:
         target = target_of(type(self))
-        for module in ("planar", "equivariant"):
+        for module in ("planar", "equivariant", "started"):
             target = target.replace(f"nsm.maps.{module}.", "nsm.maps.")
         return {"_target_": target, "network": self.network.config}
 

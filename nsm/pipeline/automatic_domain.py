@@ -11,6 +11,8 @@ from rich.console import Console
 
 from nsm.domains import Automatic, Domain, Surface, domain
 from nsm.domains.automatic import is_part_of_whole
+from nsm.domains.joint_preparation import check_common_topology
+from nsm.domains.orbifold.domain import ClosedDomain
 from nsm.errors import NsmError
 from nsm.instantiation import made
 from nsm.maps import ANALYTIC, build_analytic
@@ -49,22 +51,30 @@ def choose_domain(
         parts: whether it takes the first input, a part, into the second, a whole shape.
 
     Raises:
-        NsmError: a mesh that cannot be read.
+        NsmError: a mesh that cannot be read; ``wrong_topology``: of another genus than a closed
+            surface that is ready or analytic, or with a boundary.
     """
     found: Domain | None = None
-    topologies = []
+    topologies, names = [], []
     for given in inputs:
         own, topology = _told_by(given, config)
         found = found or own
-        topologies += [] if topology is None else [topology]
+        if topology is not None:
+            topologies.append(topology)
+            names.append(Path(given).stem if isinstance(given, (str, Path)) else "the mesh")
     into = parts and is_part_of_whole(topologies)
-    if into:
-        topologies = topologies[1:]  # the part is closed for the map
+    if into:  # the part is closed for the map
+        topologies, names = topologies[1:], names[1:]
     if found is None:
         chosen = made(config.domain).chosen(topologies) if topologies else domain("disc")
         found = chosen if closed and _suits(config, chosen) else domain("disc")
         if not found.has_boundary and not into:
             console.print(f"domain={found}: closed surfaces of genus {topologies[0][0]}, no seam")
+    elif isinstance(found, ClosedDomain):
+        wanted = (0 if found.even else 1, 0)
+        if not (parts and is_part_of_whole([*topologies, wanted])):
+            ready = f"the closed surface on the {found}"
+            check_common_topology([ready, *names], [wanted, *topologies])
     config.domain = found.config
     return found
 

@@ -19,6 +19,7 @@ from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.configured_surface import configured_repairs
+from nsm.pipeline.landmark_check import warn_of_landmarks
 from nsm.pipeline.parts import closed_parts
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
@@ -35,7 +36,6 @@ from nsm.results import (
     distortion_picture,
     export_mesh,
     export_surface,
-    isotopy_table,
     map_image,
     mean_log_distortion,
     morph_pictures,
@@ -48,6 +48,7 @@ from nsm.results import (
     write_reliability,
 )
 from nsm.results.file_faces import faces_of_file
+from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
@@ -103,6 +104,7 @@ class PairMapTask(Task):
         shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
+        warn_of_landmarks(shapes, ids, self.console)
         self.attributes = read_attributes(settings["attributes"], counts)
         repairs = configured_repairs(self.config)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
@@ -120,7 +122,8 @@ class PairMapTask(Task):
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
             self.alignments = alignments(phi.surface.part, psi.surface, common)
-            self.console.print(isotopy_table(self.alignments[:_CLASSES_SHOWN]))
+            scores = ", ".join(f"{one.score:.3f}" for one in self.alignments[:_CLASSES_SHOWN])
+            self.console.print(f"likely isotopy classes, best first: scores {scores}")
 
     @property
     def title(self) -> str:
@@ -264,7 +267,13 @@ class PairMapTask(Task):
         if self.domain.has_boundary:
             return said
         classes = [
-            {"matrix": a.matrix.astype(int).tolist(), "shift": a.shift.tolist(), "score": a.score}
+            {
+                "matrix": a.matrix.astype(int).tolist(),
+                "shift": a.shift.tolist(),
+                "mean_log_distortion": a.distortion,
+                "landmarks_missed": a.miss,
+                "score": a.score,
+            }
             for a in self.alignments[:_CLASSES_SHOWN]
         ]
         return {**said, "isotopy_class": self.config.isotopy_class, "isotopy_classes": classes}
@@ -286,6 +295,10 @@ class PairMapTask(Task):
         if self.textures is not None:
             for line in write_textured(self.textures, folder, result, self.config.texture_size):
                 self.console.print(line)
+
+    def write_inputs(self, folder: Path) -> None:
+        if len(self.ids[0]):
+            landmarks_picture(folder / "landmarks.png", [self.surface, self.psi.surface], self.ids)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface

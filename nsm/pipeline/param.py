@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from nsm.data import SurfaceData
+from nsm.domains import Surface
 from nsm.domains.baselines import BASELINES
+from nsm.domains.embedding import GIVEN
 from nsm.maps import Remembered
 from nsm.pipeline.charts import neural_charts
 from nsm.pipeline.surface_cache import neural_surface
@@ -32,6 +34,7 @@ from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
+from nsm.tasks.least_squares import fitted_to_layout
 
 
 class ParamTask(Task):
@@ -49,7 +52,9 @@ class ParamTask(Task):
 
     def prepare(self, given: Given) -> None:
         phi, seams = given.phi, self.settings.get("seams")  # absent in older run folders
-        if seams is not None:
+        ready = isinstance(phi, (NeuralSurface, Surface)) or self.config.phi.path is not None
+        laid_out = self.config.surface.parameterization == GIVEN
+        if seams is not None or (laid_out and not ready):
             self.keep_absolute("seams")
             self.charts = neural_charts(self.config, self.console, phi, seams)
             phi = self.charts[0]
@@ -92,7 +97,10 @@ class ParamTask(Task):
             torch.as_tensor(surface.faces),
             torch.as_tensor(areas, dtype=torch.float32),
         )
-        return self.module(**self.map_settings(), mesh=mesh, phi=self._for_training())
+        settings = self.map_settings()
+        if surface.given_uv is not None and settings["constraints"]["boundary"] == "free":
+            settings["start"] = fitted_to_layout(surface.given_uv, surface, seed=self.config.seed)
+        return self.module(**settings, mesh=mesh, phi=self._for_training())
 
     def _for_training(self) -> torch.nn.Module:
         """φ as the training evaluates it."""
@@ -106,7 +114,7 @@ class ParamTask(Task):
         if isinstance(result, ParameterizationAtlas):
             return  # its charts are measured
         surface = self.surface
-        maps = {"domain": surface.uv, "nsm": result.uv}
+        maps = {**self._before, "nsm": result.uv}
         for name, method in BASELINES.items():
             try:
                 maps[f"{name} (libigl)"] = method(surface.vertices, surface.faces, surface.uv)
@@ -122,6 +130,12 @@ class ParamTask(Task):
             result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(
                 self.trained.uv, surface.faces, mirrored=True
             )
+
+    @property
+    def _before(self) -> dict[str, np.ndarray]:
+        """The layouts (V, 2) that there are before h, by name."""
+        given = self.surface.given_uv
+        return {"domain": self.surface.uv, **({} if given is None else {"given": given})}
 
     def picture(self, module: Any) -> np.ndarray:
         image = layout_image(self.surface, evaluate(module, self.surface.uv))
@@ -146,7 +160,9 @@ class ParamTask(Task):
         faces = surface.faces[~surface.filled]
         write_patterns(folder / "pattern", result.uv / surface.scale, faces)
         energy = str(self.config.energy["_target_"]).rpartition(".")[2]
-        before_after = {"before: domain Ω": surface.uv, f"after: {energy}": result.uv}
+        name, before = list(self._before.items())[-1]
+        what = {"domain": "domain Ω", "given": "given UV"}[name]
+        before_after = {f"before: {what}": before, f"after: {energy}": result.uv}
         parameterization_picture(folder / "checkerboard.png", surface, before_after)
 
 

@@ -19,6 +19,7 @@ from nsm.pipeline.configured_surface import configured_repairs
 from nsm.pipeline.landmark_inputs import landmark_vertices
 from nsm.pipeline.landmark_places import as_places, with_places
 from nsm.pipeline.resolve_inputs import Shape
+from nsm.stages import stage
 from nsm.surfaces.landmark_files import to_json
 from nsm.surfaces.topology import boundary_loops
 from nsm.surfaces.validation import CleanMesh, clean
@@ -159,18 +160,19 @@ def given_or_proposed(
     if not (asked or (possible and (none or few))):
         return list(shapes), ids, None
     repairs = configured_repairs(config)
-    cleaned = [clean(mesh.vertices, mesh.faces, mesh.name, repairs) for mesh in meshes]
-    if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
-        return list(shapes), ids, None
-    if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):
-        return list(shapes), ids, None  # refused where the meshes are prepared
-    try:
-        found = _proposal(cleaned, ids, settings.alternative)
-    except NsmError as error:
-        if asked or settings.strict or error.key == "proposal.alternative":
-            raise
-        console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
-        return list(shapes), ids, None
+    with stage(console, f"proposing landmarks of {', '.join(mesh.name for mesh in meshes)}"):
+        cleaned = [clean(mesh.vertices, mesh.faces, mesh.name, repairs) for mesh in meshes]
+        if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
+            return list(shapes), ids, None
+        if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):
+            return list(shapes), ids, None  # refused where the meshes are prepared
+        try:
+            found = _proposal(cleaned, ids, settings.alternative)
+        except NsmError as error:
+            if asked or settings.strict or error.key == "proposal.alternative":
+                raise
+            console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
+            return list(shapes), ids, None
     if len(ids[0]) == _COMPLETED and not found.sure and not settings.alternative:
         console.print(f"{found.said}; only those given are taken", soft_wrap=True)
         return list(shapes), ids, None

@@ -24,6 +24,7 @@ from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
 from nsm.results.files import as_json
 from nsm.results.loggers import check_packages, log_figures, loggers_of
+from nsm.results.render import axis_of, upright
 from nsm.run_directories import is_temporary
 from nsm.stages import stage
 from nsm.tasks.ensemble import Ensemble
@@ -73,7 +74,7 @@ def run_task(
         NsmError: an input, setting or run folder that cannot be used.
     """
     started = time.monotonic()
-    with process_state():
+    with process_state(), upright(axis_of(config)):
         console = Console(highlight=False, markup=False, quiet=quiet)
         task = make_task(config, console)
         check_device(config)
@@ -112,6 +113,9 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
     """
     with stage(task.console, f"{task.title}: network and samples"):
         module, data = built(task), task.build_data()
+        if task.config.artefacts:
+            run.folder.mkdir(parents=True, exist_ok=True)
+            task.write_inputs(run.folder)
     trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
     while task.begin_again(module):
         # first this, then the new settings: a run that is killed between does the same again

@@ -254,6 +254,9 @@ class Task:
         """Write the result into the run folder."""
         result.save(folder)
 
+    def write_inputs(self, folder: Path) -> None:
+        """Write pictures of the inputs into the run folder, before the training."""
+
     def write_artefacts(self, folder: Path, result: Any) -> None:
         """Write pictures and exported meshes into the run folder."""
 

@@ -32,7 +32,6 @@ from nsm.results.surface_map import SurfaceMap
 from nsm.results.tables import (
     collection_table,
     comparison_table,
-    isotopy_table,
     metrics_table,
     pair_table,
     warning_of_tears,
@@ -80,7 +79,6 @@ __all__ = [
     "layout_image",
     "load_parameterization",
     "load_surface",
-    "isotopy_table",
     "mean_log_distortion",
     "metrics_table",
     "overfit_metrics",

@@ -285,6 +285,8 @@ def _check_arrays(surface: Surface) -> None:
             raise ValueError(f"{name} has not {columns} columns")
         if index.size and not 0 <= index.min() <= index.max() < count:
             raise ValueError(f"{name} names a vertex that is not there")
+    if surface.given_uv is not None and surface.given_uv.shape != surface.uv.shape:
+        raise ValueError("given_uv is not of these vertices")
     if (surface.lattice is None) != surface.domain.has_boundary:
         raise ValueError("lattice is missing, or there without a closed domain")
     if surface.lattice is not None and surface.lattice.shape != (2, 2):

@@ -269,7 +269,7 @@ def _compare(writer: Any, settings: Mapping[str, Any], figures: dict[str, float]
     """Make a run of TensorBoard a row of its HPARAMS tab: choices by name, settings, figures."""
     from torch.utils.tensorboard.summary import hparams
 
-    flat = {k: _cell(v) for k, v in readable(settings).items() if v is not None}
+    flat = {k: _cell(v) for k, v in readable(settings).items() if v not in (None, {}, [])}
     # no experiment summary: TensorBoard takes the first that it finds for all runs, while without
     # one it unites the settings of all, with those that differ first
     _, start, end = hparams(flat, figures)

@@ -136,6 +136,28 @@ def moved(f: SurfaceMap, points: Tensor, image: Image, *, back: bool = False) ->
     return _pieces(f, points, image, back)(points)
 
 
+def planar_moved(f: SurfaceMap, uv: Tensor) -> Tensor:
+    """Points (N, 2) of the source's domain to those (N, 2) of the target's.
+
+    Elements of a closed domain's group, on both sides of h, are translations and turns by π: they
+    leave its derivative as it is in the lift that has the triangle.
+
+    Raises:
+        NsmError: ``wrong_shape`` or ``not_finite``.
+    """
+    check_points(uv, "points of the domain")
+    at, s = uv.detach().cpu().double().numpy(), f.source.surface
+    value = f.planar(at)
+    corners = s.faces[s.domain.locate(at, s.uv, s.faces).face]
+    before, after = (
+        np.stack([x[corners[:, k]] - x[corners[:, 0]] for k in (1, 2)], axis=2)
+        for x in (s.uv, f.image_uv)
+    )
+    slope = torch.as_tensor(after @ np.linalg.inv(before)).to(uv)
+    moved = slope @ (uv - uv.detach())[:, :, None]
+    return torch.as_tensor(value).to(uv) + moved[:, :, 0]
+
+
 def value_and_jacobian(f: SurfaceMap, points: Tensor, image: Image) -> tuple[Tensor, Tensor]:
     """Images (N, 3) and Jacobians (N, 3, 3); arguments and errors as for :func:`moved`."""
     through = _pieces(f, points, image, False)

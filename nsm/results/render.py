@@ -6,7 +6,10 @@ triangle and sort them wrongly; a picture during training may take a fraction of
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -26,6 +29,24 @@ UP_AXES = {
     for sign, flip in (("", np.eye(3)), ("-", np.diag([-1.0, -1.0, 1.0])))
     for k, axis in enumerate("yzx")
 }
+
+_up: ContextVar[str] = ContextVar("up", default="y")
+
+
+@contextmanager
+def upright(axis: str) -> Iterator[None]:
+    """Within the block, views show an axis of :data:`UP_AXES` upwards."""
+    token = _up.set(axis)
+    try:
+        yield
+    finally:
+        _up.reset(token)
+
+
+def axis_of(settings: Mapping[str, Any]) -> str:
+    """The axis that settings have upwards; y where they, perhaps a stranger's, name none."""
+    axis = settings.get("up")
+    return axis if isinstance(axis, str) and axis in UP_AXES else "y"
 
 
 def frames_of(vertices: np.ndarray) -> dict[str, np.ndarray]:
@@ -152,15 +173,23 @@ class View:
     Args:
         reference: vertices (V, 3) that fill the picture.
         size: side of the picture in pixels.
-        frame: rows right, up, towards the viewer (3, 3); by default :func:`view_frame`.
+        frame: rows right, up, towards the viewer (3, 3); by default :func:`view_frame`, with the
+            axis upwards that :func:`upright` names.
     """
 
     def __init__(self, reference: np.ndarray, size: int, frame: np.ndarray | None = None) -> None:
-        self.frame = view_frame(reference) if frame is None else frame
+        self.frame = frames_of(reference)[_up.get()] if frame is None else frame
         turned = reference @ self.frame.T
         self.center = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
         self.half = 0.53 * float(np.ptp(turned[:, :2], axis=0).max())
         self.size = size
+
+    def pixels(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (V, 3) are in a picture, (V, 2) to the right and downwards, and their depth
+        (V,), larger is nearer."""
+        turned = vertices @ self.frame.T
+        flat = (turned[:, :2] - self.center[:2]) / self.half
+        return np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) * 0.5 * self.size, turned[:, 2]
 
     def draw(
         self,
@@ -178,17 +207,15 @@ class View:
             seam_pairs: (T, 2) vertices that were one before the cut, which share a normal.
         """
         fine = self.size * _SUPERSAMPLING
-        turned = vertices @ self.frame.T
-        flat = (turned[:, :2] - self.center[:2]) / self.half
-        xy = np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) * 0.5 * fine
-        pixel, face, weights = rasterise(xy, turned[:, 2], faces, fine)
+        xy, depth = self.pixels(vertices)
+        pixel, face, weights = rasterise(xy * _SUPERSAMPLING, depth, faces, fine)
         corners = faces[face]
 
         def blend(values: np.ndarray) -> np.ndarray:
             return np.einsum("pk,pkd->pd", weights, values[corners])
 
         base = colours(blend)
-        normal = blend(vertex_normals(turned, faces, seam_pairs))
+        normal = blend(vertex_normals(vertices @ self.frame.T, faces, seam_pairs))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
         facing = np.where(normal[:, 2:] < 0, -normal, normal)
         lit = 0.38 + 0.62 * np.clip(facing @ _LIGHT, 0, 1)

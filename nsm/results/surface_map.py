@@ -25,7 +25,14 @@ from nsm.results.files import write_pair
 from nsm.results.metrics import evaluate
 from nsm.results.morph_target import write_morph
 from nsm.results.points import as_points
-from nsm.results.pointwise import SurfaceMapModule, fixed_image, located, moved, value_and_jacobian
+from nsm.results.pointwise import (
+    SurfaceMapModule,
+    fixed_image,
+    located,
+    moved,
+    planar_moved,
+    value_and_jacobian,
+)
 from nsm.results.reliability import Reliability, reliability
 from nsm.results.textured_mesh import TexturedMesh, painted_by
 from nsm.results.vertex_values import by_file_vertex
@@ -189,14 +196,22 @@ class SurfaceMap:
             face[absent], weights[absent] = near
         return Places(face, weights)
 
-    def planar(self, uv: np.ndarray) -> np.ndarray:
+    @overload
+    def planar(self, uv: np.ndarray) -> np.ndarray: ...
+    @overload
+    def planar(self, uv: Tensor) -> Tensor: ...
+    def planar(self, uv: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """Points (N, 2) of the source's domain to those of the target's, (N, 2).
 
-        On a closed domain, points in any lift, and images in the lifts that h sends them to.
+        On a closed domain, points in any lift, and images in the lifts that h sends them to. For a
+        tensor the result is one of its type, on its device, with a gradient for the points: that of
+        the triangle that each is in.
 
         Raises:
             NsmError: ``wrong_shape``, ``wrong_type`` or ``not_finite``.
         """
+        if isinstance(uv, Tensor):
+            return planar_moved(self, uv)
         s = self.source.surface
         uv = as_points(uv, 2, "points of the domain")
         return s.domain.carried(uv, s.uv, self.image_uv, s.faces, s.seam_pairs)

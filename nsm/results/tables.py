@@ -8,7 +8,6 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from nsm.domains.orbifold.alignment import Alignment
 from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
 from nsm.results.pair_metrics import START
 
@@ -41,7 +40,7 @@ _MAP_COLUMNS = {
     "boundary_self_intersections": "overlaps",
 }
 # what a method of :class:`nsm.results.Parameterization` is called in the table
-_METHODS = {"domain": "before: domain Ω"}
+_METHODS = {"domain": "before: domain Ω", "given": "before: given UV"}
 
 
 def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
@@ -103,16 +102,6 @@ def warning_of_tears(name: str, metrics: Mapping[str, float]) -> Text | None:
         "closed surfaces of genus 0 or 1, domain=orbifold or domain=torus, which have no seam",
         style="bold red",
     )
-
-
-def isotopy_table(found: Sequence[Alignment]) -> Table:
-    """Starts x ↦ Bx + c of likely isotopy classes and what they are compared by, best first."""
-    table = Table("isotopy class", "B", "c", "mean log distortion", "landmarks missed", "score")
-    for number, one in enumerate(found):
-        c = [round(float(x), 3) for x in one.shift]
-        figures = (f"{x:.3f}" for x in (one.distortion, one.miss, one.score))
-        table.add_row(str(number), str(one.matrix.astype(int).tolist()), str(c), *figures)
-    return table
 
 
 _COLLECTION_COLUMNS = {

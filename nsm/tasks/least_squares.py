@@ -13,6 +13,8 @@ this is Eq. 1 (METHOD) made linear.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,7 +23,8 @@ from torch import Tensor, nn
 
 from nsm.data import SurfaceSampler
 from nsm.domains import Surface
-from nsm.maps import LatticeSplineGrid, NeuralMap
+from nsm.instantiation import target_of
+from nsm.maps import LatticeSplineGrid, LinearInFeatures, NeuralMap, build_network
 from nsm.maps.encodings import Encoding, SplineGrid, value_and_jacobian_stack
 from nsm.tasks.multigrid import folding, lattice_refinements, solve, solve_through
 
@@ -43,6 +46,7 @@ _FLATTEST = 1e-3
 # μ; positions are the better for less, and normals hardly depend on it
 _SLOPES = 1e-5
 _STREAM = -2  # of the random numbers: no step has it
+_OF_LAYOUT = (32, 128)  # cells a side of the spline through a layout in the plane
 
 
 def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> None:
@@ -60,9 +64,39 @@ def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> N
         ValueError: a grid of fewer features than the linear skip has outputs.
     """
     assert network.linear_skip is not None
-    encoding = network.encoding
     nn.init.zeros_(network.output.weight)
     nn.init.zeros_(network.output.bias)
+    fit_linear(network.encoding, network.linear_skip, surface, seed)
+
+
+def fitted_to_layout(uv: np.ndarray, surface: Surface, *, seed: int = 0) -> LinearInFeatures:
+    """A spline Ω → R² that takes a surface's vertices to places in the plane, as near as it can.
+
+    Args:
+        uv: (V, 2) the places.
+        surface: the prepared surface.
+        seed: of the samples.
+    """
+    encoding = {"_target_": target_of(SplineGrid), "resolutions": _OF_LAYOUT, "features": 2}
+    target = {"_target_": target_of(LinearInFeatures)}
+    spline: Any = build_network(target, encoding=encoding, out_dim=2)
+    flat = np.pad(uv, ((0, 0), (0, 1)))
+    fit_linear(spline.encoding, spline.linear, replace(surface, vertices=flat), seed)
+    return cast(LinearInFeatures, spline)
+
+
+def fit_linear(encoding: Encoding, linear: nn.Linear, surface: Surface, seed: int) -> None:
+    """Set a linear function of an encoding's features, and the tables of a grid, to the best fit.
+
+    Args:
+        encoding: with as many features a level as the function has values, if it is a grid.
+        linear: the function; its values are the first coordinates of a point.
+        surface: to be fitted.
+        seed: of the samples.
+
+    Raises:
+        ValueError: a grid of fewer features than there are values.
+    """
     sampler = SurfaceSampler(surface)
     grid = encoding if isinstance(encoding, SplineGrid) else None
     unknowns = max(len(table) for table in grid.tables) if grid else encoding.out_dim
@@ -72,11 +106,12 @@ def fit_linear_skip(network: NeuralMap, surface: Surface, *, seed: int = 0) -> N
     jacobian = jacobian.permute(2, 1, 0).double()
     along = _along(jacobian)
     target = _rows(torch.cat([samples.points.t()[None], jacobian]), along)
+    target = target[:, : linear.out_features]
     with torch.no_grad():
         if grid:
-            _fit_tables(grid, network.linear_skip, samples.uv, along, target)
+            _fit_tables(grid, linear, samples.uv, along, target)
         else:
-            _fit_weights(encoding, network.linear_skip, samples.uv, along, target)
+            _fit_weights(encoding, linear, samples.uv, along, target)
 
 
 def _along(jacobian: Tensor) -> Tensor:

@@ -35,6 +35,7 @@ class Param(OneMeshMap):
         mesh: uv (V, 2), faces (F, 3) and areas (F,) of the mesh whose triangles must not flip.
         phi: the surface; it is not trained.
         loss_terms: the user's own (see :mod:`nsm.tasks.terms`).
+        start: h before its training, where the boundary is free; None: the identity.
 
     Raises:
         ValueError: a constraint that is not known.
@@ -57,13 +58,14 @@ class Param(OneMeshMap):
         mesh: tuple[Tensor, Tensor, Tensor],
         phi: nn.Module,
         loss_terms: dict[str, Any] | None = None,
+        start: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["domain", "energy", "phi", "mesh"], logger=False)
+        self.save_hyperparameters(ignore=["domain", "energy", "phi", "mesh", "start"], logger=False)
         self.loss_weights = ParamWeights(**loss_weights)
         held = ParamConstraints(**constraints)
         fixed, self.folds = held.boundary == "fixed", Folds(held.injectivity)
-        self.map = planar_map(domain if fixed else None, map, activation, encoding)
+        self.map = planar_map(domain if fixed else None, map, activation, encoding, start)
         self.energy = as_blend(energy)
         self.loss_terms = made_terms(loss_terms or {})
         self.phi = phi.eval().requires_grad_(False)

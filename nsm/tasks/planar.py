@@ -5,21 +5,34 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from nsm.errors import NsmError
 from nsm.instantiation import named_object, target_of
-from nsm.maps import MultilevelSpline, NeuralMap, PlanarMap, PlanarNetwork, SplineField
+from nsm.maps import (
+    MultilevelSpline,
+    NeuralMap,
+    PlanarMap,
+    PlanarNetwork,
+    SplineField,
+    StartedMap,
+)
 from nsm.maps.networks import build_network
 
 
 def planar_map(
-    domain: Any, map: dict[str, Any], activation: dict[str, Any], encoding: dict[str, Any]
+    domain: Any,
+    map: dict[str, Any],
+    activation: dict[str, Any],
+    encoding: dict[str, Any],
+    start: nn.Module | None = None,
 ) -> Any:
-    """h: Ω → R², the identity before its training.
+    """h: Ω → R², the identity, or another given map, before its training.
 
     Args:
         domain: h maps it to itself, by construction; None: h is unconstrained.
         map, activation, encoding: settings of h's network.
+        start: what an unconstrained h is before its training; None: the identity.
 
     Raises:
         NsmError: a linear skip that is to be fitted to a surface.
@@ -45,4 +58,6 @@ def planar_map(
     if kind is PlanarNetwork:
         map = {**map, "_target_": target_of(NeuralMap)}
     network = build_network(map=map, activation=activation, encoding=encoding, out_dim=out_dim)
-    return PlanarMap(network) if domain is None else domain.equivariant(network)
+    if domain is not None:
+        return domain.equivariant(network)
+    return PlanarMap(network) if start is None else StartedMap(network, start)

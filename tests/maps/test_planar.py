@@ -6,7 +6,7 @@ from map_samples import PLANAR, activation, planar
 from torch.func import jacfwd, jacrev, vmap
 
 from nsm.errors import NsmError
-from nsm.maps import build_stored
+from nsm.maps import NeuralMap, StartedMap, build_network, build_stored
 
 SMALL = {"width": 8, "depth": 1, "act": activation("Tanh")}
 KINDS = [None, "disc", "square"]
@@ -93,3 +93,23 @@ def test_a_network_without_a_last_layer_is_refused():
 class Shift(torch.nn.Module):
     def forward(self, x):
         return x + 1
+
+
+def test_a_start_is_added_and_not_trained():
+    torch.manual_seed(0)
+    grid = {"_target_": "nsm.maps.encodings.SplineGrid", "resolutions": [4], "features": 2}
+    start = build_network({"_target_": "nsm.maps.LinearInFeatures"}, encoding=grid, out_dim=2)
+    h = StartedMap(NeuralMap(out_dim=2, width=8, depth=1), start).double()
+    x = points()
+    assert torch.equal(h(x), start(x))
+    assert {name.split(".")[0] for name, p in h.named_parameters() if p.requires_grad} == {
+        "network"
+    }
+    torch.nn.init.normal_(h.network.output.weight)
+    value, jacobian = h.value_and_jacobian(x)
+    torch.testing.assert_close(value, h(x))
+    expected = vmap(jacrev(lambda p: h(p[None])[0]))(x)
+    torch.testing.assert_close(jacobian, expected)
+    again = build_stored(h.config).double()
+    again.load_state_dict(h.state_dict())
+    assert torch.equal(again(x), value)

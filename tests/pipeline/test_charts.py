@@ -106,18 +106,57 @@ def test_seams_need_a_mesh(run):
     assert (refused.value.kind, refused.value.key) == ("conflicting_settings", "seams")
 
 
-def test_coordinates_of_a_file_are_the_start(here, tmp_path):
-    vertices, faces, uv = halves()
-    upper = vertices[faces].mean(axis=1)[:, 2] > 0
-    image = np.full((4, 4, 3), 9, np.uint8)
-    TexturedMesh(vertices, faces[upper], uv[upper], image).export(tmp_path / "half.obj")
-    TexturedMesh(vertices, faces, uv, image).export(tmp_path / "ball.obj")
-    words = [word for word in TINY if not word.startswith("surface.parameterization")]
-    words += ["surface.parameterization=given", "artefacts=false", "trainer.progress=false"]
-    run = here(*words, "surface=half.obj", "hydra.run.dir=run")
-    assert run.returncode == 0, run.stderr
-    assert "texture coordinates taken to the domain" in run.stdout
-    refused = here(*words, "surface=ball.obj")
-    assert refused.returncode == 2 and "2 islands" in refused.stderr
-    refused = here(*words, "surface=hemisphere")
-    assert refused.returncode == 2 and "texture coordinates" in refused.stderr
+def flattened_from_poles():
+    """The ball, and texture coordinates in which its halves are flattened from their poles."""
+    vertices, faces, _ = halves()
+    tilted = trimesh.transformations.euler_matrix(0.3, 0.2, 0.1)[:3, :3]  # no face is level
+    x = vertices[faces] / 30 @ tilted
+    sign = np.sign(x.mean(axis=1)[:, None, 2])
+    radius = np.linalg.norm(x[:, :, :2], axis=2)
+    angle = np.arccos(np.clip(sign * x[:, :, 2], -1, 1))
+    uv = x[:, :, :2] * (angle / np.maximum(radius, 1e-9))[:, :, None] * [1.0, 0.6]
+    return vertices, faces, uv / 8 + np.where(sign > 0, 0.25, 0.75)[:, :, None]
+
+
+GIVEN = [
+    *(word for word in WORDS if not word.startswith("surface.parameterization")),
+    "surface.parameterization=given",
+    "trainer.max_steps=0",
+]
+
+
+def test_each_island_starts_from_its_coordinates(tmp_path):
+    vertices, faces, uv = flattened_from_poles()
+    file = tmp_path / "ball (2).obj"
+    TexturedMesh(vertices, faces, uv, np.full((4, 4, 3), 9, np.uint8)).export(file)
+    atlas = nsm.parameterize(file, overrides=GIVEN, folder=tmp_path / "run", progress=False)
+    assert len(atlas.charts) == 2
+    for chart in atlas.charts:
+        surface = chart.phi.surface
+        # in the plane of the file, but for the scale and place of the whole
+        own = {tuple(sorted(f)): k for k, f in enumerate(faces.tolist())}
+        ids, corners = surface.file_faces()
+        at = [own[tuple(sorted(f))] for f in ids.tolist()]
+        given = np.array(
+            [uv[k][list(faces[k]).index(v)] for k, f in zip(at, ids, strict=True) for v in f]
+        )
+        start = chart.uv[corners.ravel()]
+        moved, wanted = start - start.mean(axis=0), given - given.mean(axis=0)
+        if np.linalg.det(np.linalg.lstsq(wanted, moved, rcond=None)[0]) < 0:
+            wanted[:, 0] *= -1  # the half that is seen from within
+        wanted *= np.linalg.norm(moved) / np.linalg.norm(wanted)
+        assert np.abs(moved - wanted).max() < 0.02 * np.abs(wanted).max()
+        both = [chart.metrics[name]["symmetric_dirichlet_median"] for name in ("given", "nsm")]
+        assert both[1] == pytest.approx(both[0], rel=0.02)
+    again = nsm.load(tmp_path / "run")
+    assert all(np.array_equal(a.uv, b.uv) for a, b in zip(again.charts, atlas.charts, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("what", "kind"),
+    [({"seams": [[0, 1]]}, "conflicting_settings"), ({"phi": "hemisphere"}, "missing_uv")],
+)
+def test_what_does_not_go_with_given_coordinates_is_refused(what, kind):
+    with pytest.raises(NsmError) as refused:
+        nsm.parameterize(**{"phi": "hemisphere", **what}, overrides=GIVEN, progress=False)
+    assert refused.value.kind == kind

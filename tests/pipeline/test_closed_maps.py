@@ -314,3 +314,10 @@ def test_the_domain_is_that_of_the_part_that_is_kept(tmp_path):
     with pytest.raises(NsmError) as error:
         chosen()
     assert error.value.kind == "disconnected"
+
+
+def test_a_mesh_of_another_genus_than_an_analytic_target_is_refused_at_once():
+    ring = trimesh.creation.torus(1.0, 0.4)
+    with pytest.raises(NsmError) as refused:
+        nsm.map_pair((ring.vertices, ring.faces), "sphere", progress=False)
+    assert refused.value.kind == "wrong_topology" and "genus 1" in str(refused.value)

@@ -1,5 +1,6 @@
 """landmarks=auto: what is said, written and refused, with a proposal that is known."""
 
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import trimesh
 from rich.console import Console
 from tiny import results
 
+from nsm import stages
 from nsm.config import compose_config
 from nsm.correspondence import CollectionProposal, Hypothesis, Proposal
 from nsm.domains import DOMAINS, Surface
@@ -221,3 +223,17 @@ def test_the_command_trains_with_them_and_leaves_the_file(here, tmp_path, monkey
     assert "WARNING" in run.stdout
     source, target = read_pairs(tmp_path / "run" / "landmarks.json")
     assert (source, target) == ([0, 1, 2, 3], [10, 11, 12, 13])
+
+
+def test_the_search_is_told_while_it_lasts(monkeypatch):
+    answers(monkeypatch, 0.5)
+    known = proposed_landmarks.proposed
+
+    def slow(*arguments):
+        time.sleep(0.3)
+        return known(*arguments)
+
+    monkeypatch.setattr(proposed_landmarks, "proposed", slow)
+    monkeypatch.setattr(stages, "QUIET_FOR", 0.05)
+    _, _, said = take("auto")
+    assert said.count("proposing landmarks of a, b") >= 2

@@ -315,6 +315,15 @@ def test_runs_are_named_by_what_they_are_of(tmp_path):
     assert labels(runs) == ["cat → horse", "u, v, w, x, 2 more", "cow (c)", "cow (d)"]
 
 
+def test_the_page_has_the_axis_of_the_runs_upwards(tmp_path):
+    for name, axis in (("a", "-z"), ("b", "-z"), ("c", "nonsense")):
+        written(tmp_path / name, up=axis, figures={"surface": "cow", "metrics": {}})
+    write_report([tmp_path], tmp_path / "report.html")
+    assert content(tmp_path / "report.html")["up"] == "-z"
+    write_report([tmp_path], tmp_path / "report.html", up="x")
+    assert content(tmp_path / "report.html")["up"] == "x"
+
+
 def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_path):
     sweep = tmp_path / "sweep-activation"
     for name in ("1", HOSTILE):

@@ -10,14 +10,17 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from tiny import results
+from tiny import dome, results
 from torch import nn
 
+from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
 from nsm.maps import NeuralMap
 from nsm.maps.encodings import RandomFourierFeatures
+from nsm.pipeline import runner
+from nsm.pipeline.task import Task
 from nsm.results import (
     NeuralSurface,
     atomic_write,
@@ -36,9 +39,10 @@ from nsm.results import (
 from nsm.results.collection_pictures import cycle_picture
 from nsm.results.evolution import extend_strip
 from nsm.results.files import as_json
+from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.pair_pictures import normals_picture
 from nsm.results.pictures import neural_normals
-from nsm.results.render import View, rasterise, vertex_normals
+from nsm.results.render import UP_AXES, View, rasterise, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.surfaces.shapes import ring_mesh
 
@@ -399,3 +403,35 @@ def test_pictures_of_normals_and_of_a_cycle_are_drawn(tmp_path):
     for name in ("normals.png", "cycle.png"):
         picture = np.asarray(Image.open(tmp_path / name).convert("RGB"), dtype=float)
         assert picture.std() > 20  # something is on it
+
+
+@pytest.mark.parametrize("axis", UP_AXES)
+def test_pictures_of_a_run_have_its_axis_upwards(axis, tmp_path, monkeypatch):
+    reference = np.random.default_rng(0).normal(size=(20, 3)) * [3, 4, 5]
+    frames = []
+
+    class Drawing(Task):
+        def choose_domain(self, given):
+            frames.append(View(reference, 8).frame)
+            raise StopIteration
+
+    task = Drawing()
+    monkeypatch.setattr(runner, "make_task", lambda config, console: task)
+    with pytest.raises(StopIteration):
+        runner.run_task(compose_config([f"up={axis}"]), tmp_path)
+    sign = -1 if axis[0] == "-" else 1
+    up = sign * frames[0][1]["xyz".index(axis[-1])]
+    assert up > 0.9
+    after = View(reference, 8).frame[1]
+    assert after[1] > 0.9  # the caller's views are as they were
+
+
+def test_landmarks_are_drawn_with_their_numbers(tmp_path):
+    surfaces = [dome(0.2, 4), dome(0.4, 4)]
+    files = [tmp_path / f"{k}.png" for k in range(2)]
+    ids = np.array([0, 10, -1, 30])
+    landmarks_picture(files[0], surfaces, [ids, ids])
+    landmarks_picture(files[1], surfaces, [np.full(4, -1)] * 2)
+    with_marks, without = (np.asarray(Image.open(f).convert("RGB"), dtype=int) for f in files)
+    assert np.ptp(without, axis=2).max() < 10  # grey
+    assert (np.ptp(with_marks, axis=2) > 100).sum() > 50  # spheres

@@ -17,7 +17,7 @@ def write_report(
     output: Path,
     title: str = "nsm report",
     trust: Sequence[str] = (),
-    up: str = "y",
+    up: str | None = None,
 ) -> tuple[int, int]:
     """Write one page about all runs in folders and their subfolders.
 
@@ -26,7 +26,8 @@ def write_report(
         output: the HTML file.
         title: of the page.
         trust: modules outside nsm whose code the files of the runs may name.
-        up: the axis of the mesh files that points up: x, y, z, -x, -y or -z.
+        up: the axis of the mesh files that points up: x, y, z, -x, -y or -z; by default what most
+            of the runs have set.
 
     Returns:
         The numbers of complete and of incomplete runs.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from nsm.errors import NsmError
+from nsm.results.render import axis_of
 from nsm.results.report.curves import read_curves
 from nsm.results.report.labels import differing, labels, over_seeds, shown
 from nsm.results.report.pictures import UNREADABLE, read_picture, read_pictures
@@ -55,7 +57,7 @@ def content(
     runs: Sequence[Run],
     incomplete: Sequence[Incomplete],
     trust: Sequence[str] = (),
-    up: str = "y",
+    up: str | None = None,
 ) -> dict[str, Any]:
     """Everything on the page. Files that cannot be read are listed with the incomplete runs."""
     arrays = _Arrays()
@@ -66,7 +68,7 @@ def content(
         tasks.append(_task(task, of_task, arrays, remarks, trust))
     return {
         "title": title,
-        "up": up,
+        "up": up or Counter(axis_of(run.settings) for run in runs).most_common(1)[0][0],
         "sweeps": _sweeps(runs, remarks),
         "tasks": tasks,
         "incomplete": remarks,

@@ -19,7 +19,7 @@ from nsm.optional_dependencies import needed
 from nsm.results.artifact import NeuralSurface
 from nsm.results.collection import SurfaceCollection
 from nsm.results.parameterization import Parameterization
-from nsm.results.render import UP_AXES
+from nsm.results.render import UP_AXES, axis_of
 from nsm.results.surface_map import SurfaceMap
 from nsm.results.view.colours import distinct_colours
 from nsm.results.view.glb import as_glb
@@ -51,7 +51,7 @@ class Viewer:
         self._overlays: list[Any] = []
         self._lock = threading.RLock()  # viser runs callbacks in several threads
         self._pair = [0, 1]
-        self.scene = scene_of(self._current())
+        self.scene = scene_of(self._current(), axis_of(result.config))
         self._build_panel()
         self._show_scene()
         server.scene.on_click()(self.on_click)
@@ -93,7 +93,7 @@ class Viewer:
         self.colouring = gui.add_dropdown("colours", names, initial_value=names[0])
         self._bar = gui.add_image(np.zeros((*_BAR, 3), dtype=np.uint8), visible=False)
         self._bar_ends = gui.add_markdown("", visible=False)
-        self.up = gui.add_dropdown("up", list(UP_AXES), initial_value="y")
+        self.up = gui.add_dropdown("up", list(UP_AXES), initial_value=axis_of(self.result.config))
         self.morph = gui.add_slider(
             "morph", 0.0, 1.0, 0.02, 0.0, hint="moves the left shape to its image"
         )
