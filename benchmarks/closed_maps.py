@@ -4,8 +4,9 @@ Existing files are kept, so that an interrupted run continues where it stopped:
 
     python benchmarks/closed_maps.py --meshes FOLDER [--only CASE ...]
 
-Seconds are the CPU time of a map on one thread, from trained surfaces, with its figures and
-certificate. The four animals are prepared together, as for a collection, other pairs as pairs.
+A pair is mapped with the default training and with experiment=fast. Seconds are the CPU time of a
+map on one thread, from trained surfaces, with its figures and certificate. The four animals are
+prepared together, as for a collection, other pairs as pairs.
 """
 
 from __future__ import annotations
@@ -44,30 +45,32 @@ KEPT = (
     "start_symmetric_dirichlet_median",
     "start_flipped_percent",
 )
+WAYS: dict[str, list[str]] = {"default": [], "fast": ["experiment=fast"]}
 START = ["trainer.max_steps=1", "artefacts=false", "certification.repair=false"]  # fills the cache
 
 
 def figures(f: Any, seconds: float) -> dict[str, Any]:
-    surfaces = {
-        phi.surface.name: {"rms_percent": phi.metrics["rms_percent"], "log": list(phi.surface.log)}
-        for phi in (f.source, f.target)
-    }
     found = {key: f.metrics[key] for key in KEPT if key in f.metrics}
-    return {"map_seconds": seconds, **found, "surfaces": surfaces}
+    return {"map_seconds": round(seconds, 1), **found}
 
 
 def pair(source: Any, target: Any, landmarks: Any, domain: str) -> dict[str, Any]:
-    """A map of two files, or of two ready surfaces."""
-    settings = ["artefacts=false"]
+    """Maps of two files, or of two ready surfaces, by the way they are trained."""
     if not isinstance(source, nsm.NeuralSurface):
         start = nsm.map_pair(
             source, target, landmarks, overrides=[*START, f"domain={domain}"], progress=False
         )
         source, target, landmarks = start.source, start.target, start.landmarks.tolist()
-    f, seconds = timed(
-        lambda: nsm.map_pair(source, target, landmarks, overrides=settings, progress=False)
-    )
-    return figures(f, seconds)
+    result = {}
+    for way, settings in WAYS.items():
+        settings = [*settings, "artefacts=false"]
+        f, seconds = timed(
+            functools.partial(
+                nsm.map_pair, source, target, landmarks, overrides=settings, progress=False
+            )
+        )
+        result[way] = figures(f, seconds)
+    return result
 
 
 @functools.cache
@@ -85,7 +88,7 @@ def of_collection(files: Sequence[str], marks: Sequence[str], i: int, j: int, do
 
 
 def collection(files: Sequence[str], marks: Sequence[str], domain: str) -> dict[str, Any]:
-    """The collection: figures of the pairs, and the time of all."""
+    """The collection with the default training: figures of the pairs, and the time of all."""
     settings = [f"domain={domain}", "artefacts=false"]
     nsm.map_collection(files, marks, overrides=[*settings, START[0]], progress=False)
     group, seconds = timed(
@@ -100,7 +103,7 @@ def collection(files: Sequence[str], marks: Sequence[str], domain: str) -> dict[
     averages = {key: mean(of[key] for of in every) for key in (*KEPT[:4], *KEPT[-3:])}
     cycles = {key: value for key, value in group.metrics.items() if key.startswith("cycle")}
     certified = {"certified": group.metrics["certified"]}
-    return {"map_seconds": seconds, **averages, **worst, **cycles, **certified}
+    return {"default": {"map_seconds": seconds, **averages, **worst, **cycles, **certified}}
 
 
 def rings(folder: Path) -> tuple[list[str], list[list[int]]]:
@@ -165,29 +168,55 @@ COLUMNS = {
 }
 
 
+RATIOS = (
+    "symmetric_dirichlet_median",
+    "symmetric_dirichlet_mean",
+    "symmetric_dirichlet_p95",
+    "map_seconds",
+)
+
+
 def tables() -> str:
     """All results as Markdown; the distortion is symmetric Dirichlet."""
-    files = sorted(RESULTS.glob("*.json"))
-    results = [json.loads(f.read_text()) for f in files]
+    results = [json.loads(f.read_text()) for f in sorted(RESULTS.glob("*.json"))]
     rows = []
-    ratios: dict[str, list[float]] = {key: [] for key in COLUMNS}
     for found in results:
-        closed = found["closed_domain"]
-        for domain in ("disc", closed):
-            of = found[domain]
-            row = [f"{of[key]:.2f}" if key in of else "–" for key in COLUMNS]
-            name = found["case"] if domain == "disc" else ""
-            rows.append([name, domain, *row, "yes" if of["certified"] else "no"])
-        for key, values in ratios.items():
-            if found["disc"].get(key) and key in found[closed]:
-                values.append(found[closed][key] / found["disc"][key])
-    means = [
-        f"{label} {mean(values):.2f}"
-        for (key, label), values in zip(COLUMNS.items(), ratios.values(), strict=True)
-        if values and not key.startswith(("landmark", "flipped", "start"))
+        for domain in ("disc", found["closed_domain"]):
+            for way, of in found[domain].items():
+                row = [f"{of[key]:.2f}" if key in of else "–" for key in COLUMNS]
+                name = found["case"] if (domain, way) == ("disc", "default") else ""
+                rows.append([name, domain, way, *row, "yes" if of["certified"] else "no"])
+    shown = table(["map", "domain", "training", *COLUMNS.values(), "certified"], rows)
+    pairs = [found for found in results if "fast" in found["disc"]]
+    compared = {
+        "Closed domain over disc": [
+            (found[found["closed_domain"]]["default"], found["disc"]["default"]) for found in pairs
+        ],
+        "Fast over default, closed domains": [
+            tuple(found[found["closed_domain"]][way] for way in ("fast", "default"))
+            for found in pairs
+        ],
+        "Fast over default, disc": [
+            tuple(found["disc"][way] for way in ("fast", "default")) for found in pairs
+        ],
+    }
+    lines = []
+    for label, ends in compared.items():
+        for kept, what in ((ends, "all"), (_of_genus_0(pairs, ends), "genus 0")):
+            means = [
+                f"{COLUMNS[key]} {mean(one[key] / other[key] for one, other in kept):.3f}"
+                for key in RATIOS
+            ]
+            lines.append(
+                f"{label}, mean of the ratios of {len(kept)} pairs ({what}): {', '.join(means)}."
+            )
+    return "\n\n".join([shown, *lines]) + "\n"
+
+
+def _of_genus_0(pairs: Sequence[dict[str, Any]], ends: Sequence[Any]) -> list[Any]:
+    return [
+        end for found, end in zip(pairs, ends, strict=True) if found["closed_domain"] == "orbifold"
     ]
-    shown = table(["map", "domain", *COLUMNS.values(), "certified"], rows)
-    return f"{shown}\n\nClosed domain over disc, mean of the ratios: {', '.join(means)}.\n"
 
 
 def main() -> None:
