@@ -34,7 +34,7 @@ def meshes():
 def answers(monkeypatch, margin, score=2.0):
     """Let the search answer with two hypotheses, in the numbers of cleaned meshes."""
     found = [
-        Hypothesis(np.array([[k, 10 + k] for k in range(n, n + 4)]), s, 5.0, 0, 0, 0, None)
+        Hypothesis(np.array([[k, 10 + k] for k in range(n, n + 4)]), s, True, None)
         for n, s in ((0, score), (20, score + margin))
     ]
 

@@ -14,6 +14,7 @@ import trimesh
 from nsm.correspondence.landmark_list import LandmarkList
 from nsm.correspondence.preview import previewed
 from nsm.errors import NsmError
+from nsm.results.files import atomic_write
 from nsm.results.meshes import by_position
 from nsm.results.view.colours import distinct_colours
 from nsm.results.view.picking import hit
@@ -125,7 +126,7 @@ class LandmarkEditor:
         text = LandmarkList(len(self.shapes), ids, names).to_json()
         left = len(self.landmarks.landmarks) - len(names)
         try:
-            self.file.write_text(text, encoding="utf-8")
+            atomic_write(self.file, text.encode())
         except OSError as error:
             self.message.content = f"not saved: {error.strerror}"
             return
