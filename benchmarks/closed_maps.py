@@ -209,17 +209,13 @@ def tables() -> str:
             tuple(found["disc"][way] for way in ("fast", "default")) for found in pairs
         ],
     }
-    lines = []
+    ratios = []
     for label, ends in compared.items():
         for kept, what in ((ends, "all"), (_of_genus_0(pairs, ends), "genus 0")):
-            means = [
-                f"{COLUMNS[key]} {mean(one[key] / other[key] for one, other in kept):.3f}"
-                for key in RATIOS
-            ]
-            lines.append(
-                f"{label}, mean of the ratios of {len(kept)} pairs ({what}): {', '.join(means)}."
-            )
-    return "\n\n".join([shown, *lines]) + "\n"
+            means = [f"{mean(one[key] / other[key] for one, other in kept):.3f}" for key in RATIOS]
+            ratios.append([f"{label}, {len(kept)} pairs ({what})", *means])
+    heads = ["mean of the ratios", *(COLUMNS[key] for key in RATIOS)]
+    return f"{shown}\n\n{table(heads, ratios)}\n"
 
 
 def _of_genus_0(pairs: Sequence[dict[str, Any]], ends: Sequence[Any]) -> list[Any]:
