@@ -197,31 +197,25 @@ def tables() -> str:
                 rows.append([name, domain, way, *row, "yes" if of["certified"] else "no"])
     shown = table(["map", "domain", "training", *COLUMNS.values(), "certified"], rows)
     pairs = [found for found in results if found["case"] != "collection"]
+    groups = {"all": pairs, "genus 0": [p for p in pairs if p["closed_domain"] == "orbifold"]}
     compared = {
-        "Closed domain over disc": [
-            (found[found["closed_domain"]]["default"], found["disc"]["default"]) for found in pairs
-        ],
-        "Fast over default, closed domains": [
-            tuple(found[found["closed_domain"]][way] for way in ("fast", "default"))
-            for found in pairs
-        ],
-        "Fast over default, disc": [
-            tuple(found["disc"][way] for way in ("fast", "default")) for found in pairs
-        ],
+        "Closed domain over disc": (("closed", "default"), ("disc", "default")),
+        "Fast over default, closed domains": (("closed", "fast"), ("closed", "default")),
+        "Fast over default, disc": (("disc", "fast"), ("disc", "default")),
     }
     ratios = []
     for label, ends in compared.items():
-        for kept, what in ((ends, "all"), (_of_genus_0(pairs, ends), "genus 0")):
-            means = [f"{mean(one[key] / other[key] for one, other in kept):.3f}" for key in RATIOS]
-            ratios.append([f"{label}, {len(kept)} pairs ({what})", *means])
+        for what, chosen in groups.items():
+            both = [[_figures_of(found, *end) for end in ends] for found in chosen]
+            means = [f"{mean(one[key] / other[key] for one, other in both):.3f}" for key in RATIOS]
+            ratios.append([f"{label}, {len(both)} pairs ({what})", *means])
     heads = ["mean of the ratios", *(COLUMNS[key] for key in RATIOS)]
     return f"{shown}\n\n{table(heads, ratios)}\n"
 
 
-def _of_genus_0(pairs: Sequence[dict[str, Any]], ends: Sequence[Any]) -> list[Any]:
-    return [
-        end for found, end in zip(pairs, ends, strict=True) if found["closed_domain"] == "orbifold"
-    ]
+def _figures_of(found: dict[str, Any], domain: str, way: str) -> dict[str, Any]:
+    figures: dict[str, Any] = found[found["closed_domain"] if domain == "closed" else domain][way]
+    return figures
 
 
 def main() -> None:

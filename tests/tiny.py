@@ -25,6 +25,14 @@ TRAINING = [
     "artefacts=false",
     "trainer.progress=false",
 ]
+# of maps in the tests: short, and of few samples
+QUICK = [
+    "experiment=quick",
+    "data.steps_per_epoch=50",
+    "data.batch_size=512",
+    "data.held_out=512",
+    "trainer.threads=1",
+]
 
 
 class Results(NamedTuple):

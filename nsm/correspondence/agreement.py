@@ -71,7 +71,7 @@ def agreement(
     ratio[known] = np.log(second[known] / first[known])
     ratio -= np.nanmedian(ratio)
     each, spread = np.full(there.shape[1], np.nan), np.full(there.shape[1], np.nan)
-    for k, row in zip(both, range(len(both)), strict=True):
+    for row, k in enumerate(both):
         others = known[row]
         if others.sum() >= FEWEST - 1:
             each[k] = _correlation(first[row, others], second[row, others])

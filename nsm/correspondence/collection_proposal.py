@@ -16,13 +16,13 @@ import numpy as np
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.layouts import quick_scores
 from nsm.correspondence.proposal import (
+    LEAST_LANDMARKS,
     LEAST_MARGIN,
     Hypothesis,
     hypotheses,
 )
 from nsm.correspondence.scores import compared
 
-_LEAST = 4  # landmarks, for common cones
 _KEPT = 5
 
 Choice = dict[int, int]  # of each member the number of its hypothesis
@@ -136,7 +136,7 @@ def _landmarks(shapes: Sequence[CoarseShape], hub: int, taken: dict[int, Hypothe
     given = [int(v) for v in shapes[hub].ids[shapes[hub].fixed]]
     rows: list[list[int]] = []
     for v in [*given, *(v for v in every if v not in given)]:
-        if not all(v in pairs for pairs in tips.values()) and len(rows) >= _LEAST:
+        if not all(v in pairs for pairs in tips.values()) and len(rows) >= LEAST_LANDMARKS:
             break
         row = [v] * len(shapes)
         for i, h in taken.items():

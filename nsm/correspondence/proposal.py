@@ -13,8 +13,8 @@ from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pair
 
 _DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which they are two
 _KEPT = 5
-_LEAST = 4  # landmarks, for common cones
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
+LEAST_LANDMARKS = 4  # for common cones
 LEAST_MARGIN = 0.2
 LARGEST_SCORE = 3.0
 
@@ -112,7 +112,7 @@ def _matched_tips(candidate: Candidate) -> np.ndarray:
     pairs = np.concatenate([fixed_pairs(candidate), pairs])
     cones = candidate.cones()
     others = _away(candidate, cones[~np.isin(cones[:, 0], pairs[:, 0])])
-    return np.concatenate([pairs, others[: max(_LEAST - len(pairs), 0)]])
+    return np.concatenate([pairs, others[: max(LEAST_LANDMARKS - len(pairs), 0)]])
 
 
 def _tips_brought_together(candidate: Candidate) -> np.ndarray:

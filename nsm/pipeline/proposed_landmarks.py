@@ -22,7 +22,7 @@ from nsm.pipeline.resolve_inputs import Shape
 from nsm.stages import stage
 from nsm.surfaces.landmark_files import to_json
 from nsm.surfaces.topology import boundary_loops
-from nsm.surfaces.validation import CleanMesh, clean
+from nsm.surfaces.validation import CleanMesh
 
 AUTO = "auto"
 _COMPLETED = 4  # landmarks at most that are completed by others
@@ -161,7 +161,7 @@ def given_or_proposed(
         return list(shapes), ids, None
     repairs = configured_repairs(config)
     with stage(console, f"proposing landmarks of {', '.join(mesh.name for mesh in meshes)}"):
-        cleaned = [clean(mesh.vertices, mesh.faces, mesh.name, repairs) for mesh in meshes]
+        cleaned = [mesh.cleaned(repairs) for mesh in meshes]
         if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
             return list(shapes), ids, None
         if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):

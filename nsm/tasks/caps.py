@@ -7,14 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import At, first_fundamental_form
+from nsm.energies import first_fundamental_form
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import Folds
 from nsm.tasks.mesh_quadrature import MeshQuadrature
 
 # of the logarithm of 1 + the distortion, beside the distortion of the part
 _WEIGHT = 0.01
-_ALL = 65_536
 
 
 class Caps(nn.Module):
@@ -46,20 +45,19 @@ class Caps(nn.Module):
             folding: weight of the folds.
             step: of the training.
         """
-        some = self.quadrature.take(_ALL)
+        some = self.quadrature.take()
         image = h(some.uv)
         B = first_fundamental_form(some.sides(psi(image)))
         determinant = some.sides(image).det() / some.determinant
-        at = At(some.centres, some.centres_on(some.points))
-        values = energy.total(energy.parts(some.metric, B, at))
+        values = energy.total(energy.parts(some.metric, B, some.at))
         folds = self.folds(determinant, some.metric, B, step)
         share = some.share
         return (share * (_WEIGHT * values.clamp(min=0).log1p() + folding * folds)).sum()
 
     def curvature(self, h: Any, psi: Any, energy: Any, folding: float, step: int) -> Curvature:
         """The second derivatives of the term by J_h; arguments as for :meth:`forward`."""
-        some = self.quadrature.take(_ALL)
-        at = At(some.centres, some.centres_on(some.points))
+        some = self.quadrature.take()
+        at = some.at
         with torch.no_grad():
             phi = self.quadrature.surface
             source = first_fundamental_form(phi.value_and_jacobian(some.centres)[1])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import first_fundamental_form
+from nsm.energies import At, first_fundamental_form
 
 _AT_ONCE = 8192
 _ALL = 65_536
@@ -50,6 +50,11 @@ class Triangles(NamedTuple):
         """(F, 2) in Ω."""
         return self.centres_on(self.uv)
 
+    @property
+    def at(self) -> At:
+        """The centres in Ω and on the surface."""
+        return At(self.centres, self.centres_on(self.points))
+
 
 class MeshQuadrature(nn.Module):
     """Triangles of a mesh, as many as are wanted, spread evenly by area.
@@ -82,7 +87,7 @@ class MeshQuadrature(nn.Module):
         return {**self.__dict__, "_taken": None}
 
     @torch.no_grad()
-    def take(self, count: int) -> Triangles:
+    def take(self, count: int = _ALL) -> Triangles:
         """All triangles; of a mesh with more than 65,536, those in the middle of ``count`` parts
         of equal area, if these are fewer."""
         if self._taken is not None and self._taken[0] == count:

@@ -48,7 +48,7 @@ class OneMeshMap(Training):
         """Points (N, 2) of a step, where they lie, and the share (N,) that each stands for:
         samples, or the centres of triangles."""
         if (some := self._triangles(batch)) is not None:
-            return some.centres, At(some.centres, some.centres_on(some.points)), some.share
+            return some.centres, some.at, some.share
         share = batch.uv.new_full((len(batch.uv),), 1 / len(batch.uv))
         return batch.uv, At(batch.uv, batch.points), share
 
@@ -64,7 +64,7 @@ class OneMeshMap(Training):
             image_metric: B (F, 2, 2), in the frames of their first two sides.
         """
         centre = some.centres_on(some.points)
-        parts = self.energy.parts(some.metric, image_metric, At(some.centres, centre))
+        parts = self.energy.parts(some.metric, image_metric, some.at)
         det = sides.det() / some.determinant
         evaluation = Evaluation(
             some.centres, centre, some.centres_on(h), some.metric, image_metric, det, some.oriented

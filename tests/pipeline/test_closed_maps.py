@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tiny
 import torch
 import trimesh
 from domains.orbifold.shapes import limbs, torus
@@ -23,15 +24,7 @@ from nsm.errors import NsmError
 from nsm.pipeline.automatic_domain import choose_domain
 from nsm.results.metrics import evaluate
 
-QUICK = [
-    "experiment=quick",
-    "data.steps_per_epoch=50",
-    "data.batch_size=512",
-    "data.held_out=512",
-    "trainer.threads=1",
-    "encoding.resolutions=[8,16]",
-    "trainer.max_steps=100",
-]
+QUICK = [*tiny.QUICK, "encoding.resolutions=[8,16]", "trainer.max_steps=100"]
 MADE = (
     'phi.overrides=["experiment=quick","trainer.threads=1","encoding.resolutions=[16,64]",'
     '"data.batch_size=512","data.held_out=512","trainer.max_steps=20"]'

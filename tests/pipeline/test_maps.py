@@ -11,6 +11,7 @@ import torch
 import trimesh
 from rich.console import Console
 from tensor_checks import check_correspondences, check_tensors, check_weights
+from tiny import QUICK
 
 import nsm
 from nsm.config import compose_config
@@ -28,13 +29,6 @@ from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.shapes import grid_mesh
 from nsm.surfaces.textures import read_texture
 
-QUICK = [
-    "experiment=quick",
-    "data.steps_per_epoch=50",
-    "data.batch_size=512",
-    "data.held_out=512",
-    "trainer.threads=1",
-]
 MADE = (
     'phi.overrides=["experiment=quick","trainer.threads=1","data.batch_size=512",'
     '"data.held_out=512","trainer.max_steps=30"]'
