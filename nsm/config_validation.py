@@ -30,7 +30,7 @@ SUPPLIED: dict[str, tuple[str, ...]] = {
     "map": ("out_dim", "activation", "encoding"),
     "encoding": ("in_dim",),
     "data": ("surface", "surfaces", "starts", "sampler", "seed"),
-    "optimizer": ("params", "groups", "fields"),
+    "optimizer": ("params", "groups", "fields", "max_steps"),
     "scheduler": ("optimizer", "max_steps"),
     "logger": ("folder", "first_step", "every"),
 }
@@ -283,14 +283,15 @@ def _build(settings: dict[str, Any]) -> None:
             kind="out_of_range",
             key="sampler.domain_share",
         )
+    max_steps = settings["trainer"]["max_steps"]
     with _same_random_numbers():
         parts = {key: settings[key] for key in ("map", "activation", "encoding")}
         with _blamed("map", parts):
             network = build_network(**parts)
         with _blamed("optimizer"):
-            optimizer = build_optimizer(network, settings["optimizer"])
+            optimizer = build_optimizer(network, settings["optimizer"], max_steps)
         with _blamed("scheduler"):
-            build_scheduler(optimizer, settings["scheduler"], settings["trainer"]["max_steps"])
+            build_scheduler(optimizer, settings["scheduler"], max_steps)
         for key in ("domain", "energy", "sampler"):
             if settings[key]:
                 with _blamed(key):

@@ -50,7 +50,7 @@ class Caps(nn.Module):
         B = first_fundamental_form(some.sides(psi(image)))
         determinant = some.sides(image).det() / some.determinant
         values = energy.total(energy.parts(some.metric, B, some.at))
-        folds = self.folds(determinant, some.metric, B, step)
+        folds = self.folds(determinant, step)
         share = some.share
         return (share * (_WEIGHT * values.clamp(min=0).log1p() + folding * folds)).sum()
 
@@ -67,7 +67,7 @@ class Caps(nn.Module):
         def term(j: Tensor) -> Tensor:
             target = first_fundamental_form(outer @ j)
             values = energy.total(energy.parts(source, target, at))
-            folds = self.folds(torch.linalg.det(j), source, target, step)
+            folds = self.folds(torch.linalg.det(j), step)
             return _WEIGHT * values.clamp(min=0).log1p() + folding * folds
 
         hessians = some.share.double()[:, None, None] * positive_hessians(term, jacobian)

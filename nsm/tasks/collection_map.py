@@ -14,7 +14,7 @@ from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.settings import CollectionConstraints
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
-from nsm.tasks.fold_barrier import FoldBarrier
+from nsm.tasks.fold_barrier import FoldBarrier, Folds
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
 
@@ -93,6 +93,7 @@ class CollectionMap(ConstrainedMap):
         )
         start = torch.stack([h.before(points) for h in self.map])  # type: ignore[operator]
         self.set_landmarks(points, targets, start, seam)
+        self.folds_of = [Folds(held.injectivity) for _ in phis]
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
@@ -112,7 +113,7 @@ class CollectionMap(ConstrainedMap):
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
-        G = self.folds.of_plane(evaluation.determinant).mean(dim=1).sum()
+        G = self._folding(evaluation.determinant)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
         U = self._triangle_term() if w.triangles > 0 else 0.0
@@ -173,6 +174,7 @@ class CollectionMap(ConstrainedMap):
     def curvatures(self) -> list[Curvature]:
         x, w, k = self.batch, self.loss_weights, len(self.map)
         pairs, scale = self._scales()
+        step = self.global_step
         with torch.no_grad():
             images, inner = batched(list(self.map)).value_and_jacobian(x.expand(k, -1, -1))
             positions, outer = batched(list(self.phis)).value_and_jacobian(images)
@@ -183,7 +185,7 @@ class CollectionMap(ConstrainedMap):
         def energy(i: int, j: Tensor) -> Tensor:
             """The part of the loss at each sample that the map of surface i has."""
             own = first_fundamental_form(outer[i].double() @ j)
-            total = scale * w.injectivity / len(x) * self.folds.of_plane(torch.linalg.det(j))
+            total = scale * w.injectivity / len(x) * self.folds_of[i](torch.linalg.det(j), step)
             for other in (n for n in range(k) if n != i):
                 there, here = At(images[i], positions[i]), At(images[other], positions[other])
                 to = self.energy.total(self.energy.parts(own, forms[other], there))
@@ -222,6 +224,11 @@ class CollectionMap(ConstrainedMap):
             batched(list(self.phis))(self(self.seam.reshape(-1, 2))).unflatten(1, (-1, 2)).unbind(2)
         )
         return ((a - b) ** 2).sum(dim=-1).mean(dim=1).sum()
+
+    def _folding(self, determinants: Tensor) -> Tensor:
+        """Σ over surfaces of G at their samples, det J_h (k, N)."""
+        both = zip(self.folds_of, determinants, strict=True)
+        return torch.stack([folds(det, self.global_step).mean() for folds, det in both]).sum()
 
     def _triangle_term(self) -> Tensor:
         both = zip(self.map, self.fold_barrier, strict=True)

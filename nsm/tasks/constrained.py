@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
-from nsm.tasks.fold_barrier import Folds, further_training, stronger
+from nsm.tasks.fold_barrier import further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
 
@@ -26,8 +26,9 @@ class ConstrainedMap(Training):
     with ``penalty``, λ_B times the mean squared distance of h(∂Ω) to ∂Ω is added, and samples that
     h maps out of Ω leave the distortion and are pulled back. With
     ``constraints.landmarks=augmented``, multipliers are updated every ``multiplier_every`` steps
-    once the ramp is over (augmented Lagrangian), so that landmarks are met whatever λ_C is; with
-    ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the landmarks' targets move
+    (at triangles, each step) once the ramp is over (augmented Lagrangian), so that landmarks are
+    met whatever λ_C is; with ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the
+    landmarks' targets move
     from where h has them at its start to their places (``constraints.ramp_of=targets``) or λ_C
     grows from a thousandth (``weights``), and the seam's weight grows from zero: with the full
     terms at once, h would fold.
@@ -71,10 +72,10 @@ class ConstrainedMap(Training):
         self.loss_weights = PairWeights(**loss_weights)
         self.constraints = self.Constraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
-        self.folds = Folds(self.constraints.injectivity)
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
+        self.triangles_from = float("inf")  # subclasses may measure at triangles
         # h maps Ω to itself by construction
         self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 
@@ -126,7 +127,9 @@ class ConstrainedMap(Training):
             return
         if self.global_step < self.multipliers_from:
             return
-        if self.global_step % held.multiplier_every == 0:
+        # at triangles a step is far longer, and nearer to the minimum
+        every = 1 if self.global_step > self.triangles_from else held.multiplier_every
+        if self.global_step % every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
                 self.multipliers += 2 * self.loss_weights.landmarks * off * self.there[..., None]

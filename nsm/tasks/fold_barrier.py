@@ -15,7 +15,7 @@ from nsm.energies import injectivity, unfold
 _COUNT = 256
 # triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
 _LOOK = 16_384
-_SMALL = 0.02  # ratio of areas where the smooth term begins
+_SMALL = 0.3  # share of a determinant where the smooth term begins
 _STEEP = 10.0  # its factor, at most, in medians
 
 
@@ -106,9 +106,9 @@ def _double_areas(corners: Tensor) -> Tensor:
 class Folds:
     """How much h folds at points: G of METHOD, or a smooth term in its place.
 
-    The smooth one takes the ratio of the areas of target and source with the sign of det J_h: it
-    begins at a small positive ratio, before h folds, so that a line search is not stopped by a
-    single point. The factor from det J_h to that ratio stays the same during a step.
+    The smooth one takes the determinant relative to what it was at the beginning of the step, and
+    begins before h folds, so that a line search is not stopped by a single point: a step may take a
+    determinant to a third for nothing. Where it was negative, the term pushes it out.
 
     Args:
         kind: exponential, or smooth.
@@ -118,22 +118,19 @@ class Folds:
         self.kind = kind
         self._held: tuple[int, Tensor] | None = None
 
-    def of_plane(self, determinant: Tensor) -> Tensor:
-        """det J_h (...) to (...), areas being those in Ω."""
-        if self.kind == "exponential":
-            return injectivity(determinant)
-        return unfold(determinant, _SMALL)
+    def __call__(self, determinant: Tensor, step: int, smooth: bool = False) -> Tensor:
+        """Determinants (...) of J_h, or of triangles relative to their own, to (...).
 
-    def __call__(self, determinant: Tensor, source: Tensor, target: Tensor, step: int) -> Tensor:
-        """det J_h (N,), A and B (N, 2, 2) to (N,)."""
-        if self.kind == "exponential":
+        Args:
+            determinant: of h.
+            step: of the training; what is smooth holds the first values of each.
+            smooth: whatever the kind is.
+        """
+        if self.kind == "exponential" and not smooth:
             return injectivity(determinant)
-        if self._held is None or self._held[0] != step or len(self._held[1]) != len(determinant):
-            with torch.no_grad():
-                of_source = torch.linalg.det(source.double()).clamp(min=1e-24)
-                areas = (torch.linalg.det(target.double()).clamp(min=0) / of_source).sqrt()
-                scale = areas / determinant.double().abs().clamp(min=1e-12)
-                self._held = step, scale.clamp(max=_STEEP * float(scale.median()))
+        if self._held is None or self._held[0] != step or self._held[1].shape != determinant.shape:
+            scale = 1 / determinant.detach().double().abs().clamp(min=1e-12)
+            self._held = step, scale.clamp(max=_STEEP * float(scale.median()))
         return unfold(determinant * self._held[1].to(determinant), _SMALL)
 
     def __getstate__(self) -> dict[str, object]:

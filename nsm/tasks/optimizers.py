@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -90,13 +91,16 @@ def takes_matrices(target: str) -> bool:
     return target == target_of(MuonBesideAdam)
 
 
-def build_optimizer(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer:
+def build_optimizer(
+    module: nn.Module, settings: Mapping[str, Any], max_steps: int = 0
+) -> Optimizer:
     """The optimizer of a training.
 
     Args:
         module: whose parameters are trained; those of a ``tables`` list (feature grids, each
             entry of which sees few samples in a step) take ``encoding_lr``, if it is given.
         settings: ``_target_`` and the optimizer's own parameters, ``lr`` and ``encoding_lr``.
+        max_steps: length of the training.
 
     Raises:
         NsmError: a rate is negative, or the optimizer does not accept its parameters.
@@ -115,8 +119,8 @@ def build_optimizer(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer
     matrices = [key for key, p in named.items() if by_matrix and _hidden_matrix(key, p)]
     others = [p for key, p in named.items() if ".tables." not in key and key not in matrices]
     kind = named_object(rest["_target_"])
-    if kind is QuasiNewton:
-        return _quasi_newton(module, rest)
+    if inspect.isclass(kind) and issubclass(kind, QuasiNewton):
+        return _quasi_newton(module, rest, max_steps)
     if kind is torch.optim.LBFGS:  # takes one group of parameters, and so one learning rate
         others, grids = others + grids, []
     # the names are those of the learning rates in the log
@@ -139,7 +143,7 @@ def build_optimizer(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer
     return made(rest, groups)  # type: ignore[no-any-return]
 
 
-def _quasi_newton(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer:
+def _quasi_newton(module: nn.Module, settings: Mapping[str, Any], max_steps: int) -> Optimizer:
     fields = [part for part in module.modules() if isinstance(part, SplineField)]
     trained = [p for p in module.parameters() if p.requires_grad]
     if len(fields) != len(trained):
@@ -150,7 +154,8 @@ def _quasi_newton(module: nn.Module, settings: Mapping[str, Any]) -> Optimizer:
             key="optimizer",
         )
     group = {"params": trained, "name": "spline"}
-    return made_with(settings, params=[group], fields=fields)  # type: ignore[no-any-return]
+    offered = {"params": [group], "fields": fields, "max_steps": max_steps}
+    return made_with(settings, **offered)  # type: ignore[no-any-return]
 
 
 def _hidden_matrix(key: str, p: Tensor) -> bool:
@@ -164,4 +169,6 @@ def configure(module: nn.Module, settings: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         NsmError: as :func:`build_optimizer` and :func:`nsm.tasks.schedules.build_scheduler`.
     """
-    return scheduled(build_optimizer(module, settings["optimizer"]), settings)
+    return scheduled(
+        build_optimizer(module, settings["optimizer"], settings["max_steps"]), settings
+    )

@@ -13,7 +13,7 @@ from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.caps import Caps
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
-from nsm.tasks.fold_barrier import FoldBarrier
+from nsm.tasks.fold_barrier import FoldBarrier, Folds
 from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, Term
@@ -76,6 +76,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         self.psi = psi.eval().requires_grad_(False)
         self.image = Composition(self.psi, self.map)
         held = self.constraints
+        self.folds = Folds(held.injectivity)
         self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
         uv, faces = mesh
         part = faces if caps is None else faces[~caps]
@@ -96,7 +97,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         G = self._folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
-        U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
+        U = self._weakest() if w.triangles > 0 else 0.0
         K = self._cap_term() if self.caps is not None else 0.0
         C, multipliers = self.landmark_terms()
 
@@ -155,18 +156,20 @@ class PairMap(ConstrainedMap, OneMeshMap):
 
     def curvatures(self) -> list[Curvature]:
         w = self.loss_weights
-        uv, at, share = self._places(self.batch)  # of triangles, nearly theirs
+        places = self._places(self.batch)
+        uv = places.uv
         with torch.no_grad():
             source, _, jacobian, image = self._at(uv)
             outer = self.psi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
 
         def energy(j: Tensor) -> Tensor:
             target = first_fundamental_form(outer @ j)
-            values = self.energy.total(self.energy.parts(source, target, at))
-            folds = self.folds(torch.linalg.det(j), source, target, self.global_step)
-            return values + w.injectivity * folds
+            values = self.energy.total(self.energy.parts(source, target, places.at))
+            det = torch.linalg.det(j) + places.excess
+            folds = self.folds(det, self.global_step, smooth=True)
+            return values + w.injectivity * places.told * folds
 
-        hessians = share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        hessians = places.share.double()[:, None, None] * positive_hessians(energy, jacobian)
         found = [Curvature(self.map, uv, hessians)]
         if self.caps is not None:
             step = self.global_step

@@ -83,7 +83,7 @@ class Param(OneMeshMap):
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         G = self._folding(evaluation)
-        U = self.fold_barrier(self.map, self.global_step) if w.triangles > 0 else 0.0
+        U = self._weakest() if w.triangles > 0 else 0.0
 
         loss = energy + w.injectivity * G + w.triangles * U
         terms: dict[str, Term] = {
@@ -118,18 +118,19 @@ class Param(OneMeshMap):
 
     def curvatures(self) -> list[Curvature]:
         w = self.loss_weights
-        uv, at, share = self._places(self.batch)  # of triangles, nearly theirs
+        places = self._places(self.batch)
         with torch.no_grad():
-            source, jacobian, _ = self._at(uv)
+            source, jacobian, _ = self._at(places.uv)
 
         def energy(j: Tensor) -> Tensor:
             target = first_fundamental_form(j)
-            values = self.energy.total(self.energy.parts(source, target, at))
-            folds = self.folds(torch.linalg.det(j), source, target, self.global_step)
-            return values + w.injectivity * folds
+            values = self.energy.total(self.energy.parts(source, target, places.at))
+            det = torch.linalg.det(j) + places.excess
+            folds = self.folds(det, self.global_step, smooth=True)
+            return values + w.injectivity * places.told * folds
 
-        hessians = share.double()[:, None, None] * positive_hessians(energy, jacobian)
-        return [Curvature(self.map, uv, hessians)]
+        hessians = places.share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        return [Curvature(self.map, places.uv, hessians)]
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""

@@ -16,7 +16,8 @@ from nsm.tasks.curvature import Curvature
 from nsm.tasks.spline_level import Level, Metric
 
 _SUFFICIENT = 1e-4  # Armijo's condition
-_TRIALS = 8
+_TRIALS = 14
+_HALVED = 3  # trials at most by half; then a triangle folds within a short way
 _FLAT = 1e-10  # pairs of less curvature say nothing
 # largest change of a coefficient in the first iteration of a step without known curvature
 _FIRST = 0.02
@@ -98,6 +99,11 @@ class QuasiNewton(Optimizer):
         """Take the function that gives the curvature of the loss as it was last evaluated."""
         self.curvatures = curvatures
 
+    @property
+    def first_length(self) -> float:
+        """The length that the line search tries first, in quasi-Newton steps."""
+        return float(self.param_groups[0]["lr"])
+
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
         """The iterations of a step.
@@ -156,8 +162,8 @@ class QuasiNewton(Optimizer):
     ) -> tuple[np.ndarray, _Found, bool] | None:
         """One iteration: the coefficients and what is found there, and whether no step serves."""
         d = -search.direction(found.gradient)
-        slope, length = float(found.gradient @ d), search.first(d, self.param_groups[0]["lr"])
-        for _ in range(_TRIALS if slope < 0 else 0):
+        slope, length = float(found.gradient @ d), search.first(d, self.first_length)
+        for trial in range(_TRIALS if slope < 0 else 0):
             new = self._evaluated(closure, at + length * d)
             if new is None:
                 return None
@@ -166,7 +172,7 @@ class QuasiNewton(Optimizer):
                 return at + length * d, new, False
             excess = new.value - found.value - length * slope  # of the parabola through both ends
             least = -slope * length**2 / (2 * excess) if excess > 0 else 0.5 * length
-            length = min(max(least, 0.1 * length), 0.5 * length)
+            length = min(max(least, 0.1 * length), (0.5 if trial < _HALVED else 0.25) * length)
         self._put(at)
         return at, found, True
 

@@ -1,0 +1,87 @@
+"""Adam first, quasi-Newton steps at the end: what maps are trained by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+
+from nsm.maps import SplineField
+from nsm.settings import Share
+from nsm.tasks.multilevel_adam import MultilevelAdam
+from nsm.tasks.quasi_newton import QuasiNewton
+
+
+class AdamThenNewton(QuasiNewton):
+    """Steps of Adam in the coordinates of a spline's levels, then quasi-Newton steps.
+
+    Adam's samples, other ones in each step, lead past the local minima of a fixed quadrature. Near
+    the end its noise is what is left, and few quasi-Newton steps, at the mesh's own triangles,
+    reach what Adam needs a thousand steps for.
+
+    Args:
+        params: the coefficients of all ``fields``.
+        fields: the splines.
+        max_steps: length of the training.
+        newton_from: share of the steps after which they are quasi-Newton's.
+        iterations: of L-BFGS in a quasi-Newton step.
+        memory: pairs of steps and changes of the gradient that are kept.
+        smoothing: weight of the smoothness in quasi-Newton steps.
+        lr: Adam's rate, of a level's coordinates.
+        betas, eps: Adam's.
+        clip: largest norm of a gradient that Adam takes, by the levels' coordinates.
+
+    Raises:
+        ValueError: a parameter is out of range.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        fields: Sequence[SplineField],
+        max_steps: int,
+        newton_from: Share = 0.97,
+        iterations: int = 15,
+        memory: int = 12,
+        smoothing: float = 0.1,
+        lr: float = 1e-2,
+        betas: Sequence[float] = (0.9, 0.99),
+        eps: float = 1e-12,
+        clip: float = 1.0,
+    ) -> None:
+        cells = [field.cells for field in fields]
+        super().__init__(params, fields, cells[:1], [], iterations, memory, smoothing, lr)
+        self.newton_from = newton_from * max_steps
+        self.adams = [
+            MultilevelAdam(f, (float(betas[0]), float(betas[1])), eps, clip) for f in fields
+        ]
+
+    @property
+    def first_length(self) -> float:
+        return 1.0  # the rate is Adam's
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """A step of Adam, or the iterations of a quasi-Newton step.
+
+        Args:
+            closure: evaluates loss and gradients at the present coefficients.
+
+        Returns:
+            The loss; after a quasi-Newton step, that at its end.
+        """
+        count = self.state[self.fields[0].coefficients]
+        if count["step"] >= self.newton_from:
+            return super().step(closure)
+        assert closure is not None
+        with torch.enable_grad():
+            loss = closure()
+        gradients = [field.coefficients.grad for field in self.fields]
+        if loss is None or any(g is None for g in gradients):  # rolled back
+            return None
+        for field, adam, g in zip(self.fields, self.adams, gradients, strict=True):
+            state, lr = self.state[field.coefficients], self.param_groups[0]["lr"]
+            field.coefficients.add_(adam.change(g, state, count["step"], lr))  # type: ignore[arg-type]
+        count["step"] += 1
+        return loss
