@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,6 +12,7 @@ from torch import Tensor
 from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
 from nsm.tasks.fold_barrier import further_training, stronger
+from nsm.tasks.mesh_quadrature import MeshQuadrature
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
 
@@ -56,6 +59,8 @@ class ConstrainedMap(Training):
     there: Tensor
     seam: Tensor
     boundary_samples: Tensor
+    quadrature: MeshQuadrature | None
+    triangles_from: float
     multipliers: Tensor
 
     def __init__(
@@ -75,7 +80,7 @@ class ConstrainedMap(Training):
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
-        self.triangles_from = float("inf")  # subclasses may measure at triangles
+        self.quadrature, self.triangles_from = None, math.inf  # subclasses may measure at triangles
         # h maps Ω to itself by construction
         self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 
@@ -134,12 +139,19 @@ class ConstrainedMap(Training):
                 off = self(self.points) - self.targets
                 self.multipliers += 2 * self.loss_weights.landmarks * off * self.there[..., None]
 
-    def strengthen(self, steps: int) -> None:
+    def strengthen(self, steps: int) -> int:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of
-        folding triangles is ten times as large and acts on more of them, in small steps."""
+        folding triangles is ten times as large and acts on more of them, in small steps.
+
+        Returns:
+            The steps that it takes.
+        """
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
-        further_training(self, steps)
+        if self.quadrature is not None:
+            self.triangles_from, weights = 0.0, self.loss_weights
+            self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
+        return further_training(self, steps)
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:
         """Log held-out figures: distortion, folds, and samples outside Ω."""

@@ -44,7 +44,7 @@ class MultilevelAdam:
             _on(Level(SplineField(1, 2 * n, field.periodic, field.odd), n).up, field.coefficients)
             for n in cells[:-1]
         ]
-        self.turned = [up.t().to_sparse_csr() for up in self.refinements]
+        self.turned = [up.t().coalesce() for up in self.refinements]
 
     def change(
         self, gradient: Tensor, state: MutableMapping[str, Any], step: int, lr: float
@@ -86,7 +86,7 @@ class MultilevelAdam:
 
 def _on(matrix: Any, like: Tensor) -> Tensor:
     """A sparse matrix of the type and on the device of a tensor."""
-    m = matrix.tocsr()
-    parts = (torch.from_numpy(p.astype(np.int64)) for p in (m.indptr, m.indices))
-    data = torch.from_numpy(m.data.astype(np.float64)).to(like.dtype)
-    return torch.sparse_csr_tensor(*parts, data, m.shape).to(like.device)
+    m = matrix.tocoo()
+    places = torch.from_numpy(np.stack([m.row, m.col]).astype(np.int64))
+    values = torch.from_numpy(m.data.astype(np.float64)).to(like.dtype)
+    return torch.sparse_coo_tensor(places, values, m.shape).coalesce().to(like.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -132,10 +133,13 @@ class Param(OneMeshMap):
         hessians = places.share.double()[:, None, None] * positive_hessians(energy, jacobian)
         return [Curvature(self.map, places.uv, hessians)]
 
-    def strengthen(self, steps: int) -> None:
+    def strengthen(self, steps: int) -> int:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
         self.loss_weights = stronger(self.loss_weights)
-        further_training(self, steps)
+        if self.quadrature is not None:
+            self.triangles_from, weights = 0.0, self.loss_weights
+            self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
+        return further_training(self, steps)
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         distortion, evaluation = self._evaluated(batch)
