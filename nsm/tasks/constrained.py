@@ -20,6 +20,8 @@ from nsm.tasks.training import Training
 _ON_BOUNDARY = 1e-6
 # share of λ_C with which the ramp of the weights begins
 _FIRST = 1e-3
+# factor of λ_C at triangles, where few steps are left to meet the landmarks
+_LAST = 10.0
 
 
 class ConstrainedMap(Training):
@@ -81,6 +83,7 @@ class ConstrainedMap(Training):
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
         self.quadrature, self.triangles_from = None, math.inf  # subclasses may measure at triangles
+        self.closer = _LAST
         # h maps Ω to itself by construction
         self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 
@@ -107,9 +110,12 @@ class ConstrainedMap(Training):
 
     @property
     def landmark_weight(self) -> float:
-        """λ_C, as far as it has risen on the ramp."""
+        """λ_C, as far as it has risen on the ramp; more at triangles."""
         raised = self.constraints.ramp_of == "weights"
-        return self.loss_weights.landmarks * (_FIRST ** (1 - self.ramp) if raised else 1.0)
+        share = _FIRST ** (1 - self.ramp) if raised else 1.0
+        if self.global_step >= self.triangles_from:
+            share *= self.closer
+        return self.loss_weights.landmarks * share
 
     def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
         """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target, which may
@@ -134,10 +140,11 @@ class ConstrainedMap(Training):
             return
         # at triangles a step is far longer, and nearer to the minimum
         every = 1 if self.global_step > self.triangles_from else held.multiplier_every
+        weight = self.landmark_weight  # of the step that has been made
         if self.global_step % every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
-                self.multipliers += 2 * self.loss_weights.landmarks * off * self.there[..., None]
+                self.multipliers += 2 * weight * off * self.there[..., None]
 
     def strengthen(self, steps: int) -> int:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of
@@ -149,7 +156,7 @@ class ConstrainedMap(Training):
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
         if self.quadrature is not None:
-            self.triangles_from, weights = 0.0, self.loss_weights
+            self.triangles_from, self.closer, weights = 0.0, 1.0, self.loss_weights
             self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
         return further_training(self, steps)
 

@@ -89,4 +89,8 @@ def _on(matrix: Any, like: Tensor) -> Tensor:
     m = matrix.tocoo()
     places = torch.from_numpy(np.stack([m.row, m.col]).astype(np.int64))
     values = torch.from_numpy(m.data.astype(np.float64)).to(like.dtype)
-    return torch.sparse_coo_tensor(places, values, m.shape).coalesce().to(like.device)
+    return (
+        torch.sparse_coo_tensor(places, values, m.shape, check_invariants=False)
+        .coalesce()
+        .to(like.device)
+    )
