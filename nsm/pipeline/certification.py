@@ -14,7 +14,7 @@ from nsm.results.certificate import verdict
 from nsm.results.divergence_guard import DivergenceGuard
 from nsm.settings import PRECISIONS
 
-_SHARE = 10  # a further training has at most this part of the training's steps
+_SHARE = 10  # a further training has this part of the training's steps
 _OVERLAPS = "boundary_self_intersections"  # of a free boundary
 
 
@@ -28,7 +28,7 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
 
     Args:
         task: with ``certification.repair`` and ``certification.rounds`` in its settings.
-        module: the trained module, whose ``strengthen(steps)`` gives the steps to be made.
+        module: the trained module, which has ``strengthen(steps)``.
         data: its samples.
 
     Returns:
@@ -75,7 +75,8 @@ def _trainable(result: Any) -> bool:
 
 def _train_on(task: Task, module: Any, data: pl.LightningDataModule) -> None:
     config = task.config
-    steps = module.strengthen(max(1, config.trainer.max_steps // _SHARE))
+    steps = max(1, config.trainer.max_steps // _SHARE)
+    module.strengthen(steps)
     guard = DivergenceGuard(task.console)
     trainer = lightning_trainer(config, [guard], devices=1, max_steps=steps, limit_val_batches=0)
     with matmul_precision(PRECISIONS[config.trainer.precision]):

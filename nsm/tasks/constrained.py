@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
-from nsm.tasks.fold_barrier import further_training, stronger
+from nsm.tasks.fold_barrier import NEWTON_FROM, further_training, stronger
 from nsm.tasks.mesh_quadrature import MeshQuadrature
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 from nsm.tasks.training import Training
@@ -83,7 +83,6 @@ class ConstrainedMap(Training):
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
         self.quadrature, self.triangles_from = None, math.inf  # subclasses may measure at triangles
-        self.closer = _LAST
         # h maps Ω to itself by construction
         self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 
@@ -114,7 +113,7 @@ class ConstrainedMap(Training):
         raised = self.constraints.ramp_of == "weights"
         share = _FIRST ** (1 - self.ramp) if raised else 1.0
         if self.global_step >= self.triangles_from:
-            share *= self.closer
+            share *= _LAST
         return self.loss_weights.landmarks * share
 
     def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
@@ -146,19 +145,15 @@ class ConstrainedMap(Training):
                 off = self(self.points) - self.targets
                 self.multipliers += 2 * weight * off * self.there[..., None]
 
-    def strengthen(self, steps: int) -> int:
+    def strengthen(self, steps: int) -> None:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of
-        folding triangles is ten times as large and acts on more of them, in small steps.
-
-        Returns:
-            The steps that it takes.
-        """
+        folding triangles is ten times as large and acts on more of them, in small steps."""
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
         if self.quadrature is not None:
-            self.triangles_from, self.closer, weights = 0.0, 1.0, self.loss_weights
+            self.triangles_from, weights = NEWTON_FROM * steps, self.loss_weights
             self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
-        return further_training(self, steps)
+        further_training(self, steps)
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:
         """Log held-out figures: distortion, folds, and samples outside Ω."""

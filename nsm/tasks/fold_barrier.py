@@ -16,7 +16,7 @@ _COUNT = 256
 # triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
 _LOOK = 16_384
 _SMALL = 0.3  # share of a determinant where the smooth term begins
-_NEWTON_STEPS = 3
+NEWTON_FROM = 0.9  # of a further training
 _STEEP = 10.0  # its factor, at most, in medians
 
 
@@ -147,20 +147,16 @@ def stronger(weights: Weights) -> Weights:
     return replace(weights, triangles=triangles)  # type: ignore[type-var]
 
 
-def further_training(module: pl.LightningModule, steps: int) -> int:
+def further_training(module: pl.LightningModule, steps: int) -> None:
     """Prepare a further training at a tenth of the rates, with four times as many triangles seen.
-
-    Quasi-Newton steps are few, and come without Adam's, whose noise would move landmarks.
-
-    Returns:
-        Its steps: as many as wanted, or 3 quasi-Newton ones.
+    Where quasi-Newton steps end a training, the last tenth are such, and bring landmarks back.
     """
     for part in module.modules():
         if isinstance(part, FoldBarrier):
             part.watch(4 * part.chosen.shape[-1])
     optimizer = module.hparams["optimizer"]
     if "newton_from" in optimizer:
-        optimizer["newton_from"], steps = 0.0, min(steps, _NEWTON_STEPS)
+        optimizer["newton_from"] = NEWTON_FROM
     for rate in ("lr", "encoding_lr"):
         if optimizer.get(rate) is not None:
             optimizer[rate] *= 0.1
@@ -168,4 +164,3 @@ def further_training(module: pl.LightningModule, steps: int) -> int:
     if "warmup" in scheduler:
         scheduler["warmup"] = min(scheduler["warmup"], steps // 10)
     module.hparams["max_steps"] = steps
-    return steps

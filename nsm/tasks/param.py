@@ -12,7 +12,7 @@ from nsm.data import Samples
 from nsm.energies import At, first_fundamental_form
 from nsm.settings import ParamConstraints, ParamWeights
 from nsm.tasks.curvature import Curvature, positive_hessians
-from nsm.tasks.fold_barrier import FoldBarrier, Folds, further_training, stronger
+from nsm.tasks.fold_barrier import NEWTON_FROM, FoldBarrier, Folds, further_training, stronger
 from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
@@ -133,13 +133,13 @@ class Param(OneMeshMap):
         hessians = places.share.double()[:, None, None] * positive_hessians(energy, jacobian)
         return [Curvature(self.map, places.uv, hessians)]
 
-    def strengthen(self, steps: int) -> int:
+    def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
         self.loss_weights = stronger(self.loss_weights)
         if self.quadrature is not None:
-            self.triangles_from, weights = 0.0, self.loss_weights
+            self.triangles_from, weights = NEWTON_FROM * steps, self.loss_weights
             self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
-        return further_training(self, steps)
+        further_training(self, steps)
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
         distortion, evaluation = self._evaluated(batch)

@@ -129,7 +129,6 @@ def test_further_trainings_are_guarded_and_a_failure_keeps_what_there_is(monkeyp
     class Module:
         def strengthen(self, steps):
             assert steps >= 1
-            return steps
 
     monkeypatch.setattr(certification, "lightning_trainer", no_trainer)
     best, _ = certification.certified(Scripted(Found(5, mended=1)), Module(), None)
