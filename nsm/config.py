@@ -220,7 +220,9 @@ def setting_error(error: Exception) -> NsmError:
         # an experiment that chooses options by the task, for one that has none of them
         for task in (path.stem for path in (conf_folder() / "task").glob("*.yaml")):
             if name.endswith(f"_{task}"):
-                message = f"the experiment has no {group} for task={task}; see nsm --help experiment"
+                message = (
+                    f"the experiment has no {group} for task={task}; see nsm --help experiment"
+                )
                 return NsmError(message, kind="unknown_option", key="experiment")
         hint = nearest(name, re.findall(r"^\t(\S+)$", text, re.MULTILINE))
         message = f"{group}={name} does not exist; {hint}"
