@@ -49,9 +49,9 @@ def measured(path: Path, domain: str) -> dict[str, float]:
 
 
 def closed_meshes(folder: Path) -> list[Path]:
-    """The meshes of a folder that are closed and of genus 0."""
+    """The meshes of a folder that are closed and of genus 0, the smallest files first."""
     found = []
-    for file in sorted(folder.iterdir()):
+    for file in sorted(folder.iterdir(), key=lambda file: file.stat().st_size):
         if file.suffix.lower() in EXTENSIONS:
             mesh = given_mesh(file)
             if genus_and_boundary(clean(mesh.vertices, mesh.faces, mesh.name).faces) == (0, 0):
@@ -87,9 +87,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", type=Path, default=Path("meshes"), help="folder of the meshes")
     parser.add_argument("--output", type=Path, default=RESULT)
+    parser.add_argument("--only", nargs="+", metavar="SHAPE", help="the others stay as they are")
     given = parser.parse_args()
     results: dict[str, dict[str, dict[str, float]]] = {}
+    if given.only and given.output.exists():
+        results = json.loads(given.output.read_text())
     for file in closed_meshes(given.meshes):
+        if given.only and file.stem not in given.only:
+            continue
         results[file.stem] = {domain: measured(file, domain) for domain in DOMAINS}
         given.output.write_text(json.dumps(results, indent=1) + "\n")
         for domain, figures in results[file.stem].items():

@@ -157,7 +157,7 @@ def _fit_tables(
     nn.init.zeros_(linear_skip.weight)
     nn.init.zeros_(linear_skip.bias)
     # neighbours follow each other: what they see of a table, and add to, is near in memory
-    order = grid.seen(uv, len(grid.tables) - 1)[0][:, 0].argsort()
+    order = grid.first_row(uv, len(grid.tables) - 1).argsort()
     uv, along, left = uv[order], along[..., order], target[..., order]
     column = grid.out_dim - grid.features * len(grid.tables)  # past x itself, if it is a feature
     for level, table in enumerate(grid.tables):
