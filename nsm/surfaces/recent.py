@@ -29,7 +29,7 @@ class Recent:
 
         Args:
             key: all that the result depends on.
-            make: a tuple or data class of arrays (also within tuples) and immutable values.
+            make: an array, or a tuple or data class of arrays and immutable values.
         """
         if key in self._kept:
             self._kept.move_to_end(key)
