@@ -217,6 +217,13 @@ def setting_error(error: Exception) -> NsmError:
         return NsmError(message, kind="already_set", key=found[1])
     if found := re.search(r"Could not find '([^']+)/([^'/]+)'", text):
         group, name = found.groups()
+        # an experiment that chooses options by the task, for one that has none of them
+        for task in (path.stem for path in (conf_folder() / "task").glob("*.yaml")):
+            if name.endswith(f"_{task}"):
+                message = (
+                    f"the experiment has no {group} for task={task}; see nsm --help experiment"
+                )
+                return NsmError(message, kind="unknown_option", key="experiment")
         hint = nearest(name, re.findall(r"^\t(\S+)$", text, re.MULTILINE))
         message = f"{group}={name} does not exist; {hint}"
         return NsmError(message, kind="unknown_option", key=group)

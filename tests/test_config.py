@@ -172,12 +172,13 @@ def test_groups_can_be_changed_separately():
 @pytest.mark.parametrize(
     ("overrides", "linear_skip", "steps"),
     [
-        ([], "fitted", 1000),
-        (["map=residual"], "fitted", 1000),
+        ([], "fitted", 250),
+        (["map=residual"], "fitted", 250),
         (["initialization=random"], "none", 8000),
         (["encoding=fourier"], "none", 8000),
         (["encoding=identity"], "none", 8000),
-        (["encoding=fourier", "initialization=fitted"], "fitted", 1000),
+        (["encoding=fourier", "initialization=fitted"], "fitted", 250),
+        (["experiment=fit"], "fitted", 0),
         (["experiment=paper"], "none", 50_000),
         (["sweep=activation"], "none", 8000),
         (["task=param"], "none", 2000),
@@ -187,7 +188,7 @@ def test_groups_can_be_changed_separately():
 def test_only_a_grid_and_a_surface_can_be_fitted(overrides, linear_skip, steps):
     config = compose_config(overrides)
     assert (config.map.linear_skip, config.trainer.max_steps) == (linear_skip, steps)
-    assert config.scheduler.get("peak", 1.0) == (0.003 if linear_skip == "fitted" else 1.0)
+    assert config.scheduler.get("peak", 1.0) == (0.0005 if linear_skip == "fitted" else 1.0)
 
 
 def test_the_surface_group_is_the_catalogue():
@@ -216,6 +217,7 @@ def test_no_grid_hides_the_activation_in_its_sweep():
         ("activation=sillu", "unknown_option", "activation"),
         ("surface=bunnny", "unknown_option", "surface"),
         ("domain=squre", "unknown_option", "domain"),
+        ("task=overfit experiment=fast", "unknown_option", "experiment"),
         ("trainer.max_steps=many", "wrong_type", "trainer.max_steps"),
         ("trainer.accelerator=gppu", "unknown_option", "trainer.accelerator"),
         ("trainer.precision=half", "unknown_option", "trainer.precision"),

@@ -45,7 +45,7 @@ def test_the_values_are_those_of_the_run():
 @pytest.mark.parametrize(
     ("arguments", "steps"),
     [
-        ([], 1000),
+        ([], 250),
         (["task=param"], 2000),
         (["initialization=random"], 8000),
         (["trainer.max_steps=7"], 7),

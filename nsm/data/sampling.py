@@ -73,11 +73,15 @@ class SurfaceSampler:
         """
         if not stratified:
             return self._at(*self._places(count, generator))
-        face, weights = self._places(count, generator)
+        weights = self._places(count, generator)[1]
+        return self._at(self._one_in_each_part(count, generator), weights)
+
+    def _one_in_each_part(self, count: int, generator: torch.Generator) -> Tensor:
+        """Faces (count,), rising: one random point's in each of ``count`` parts of equal area."""
         dice = torch.rand(count, generator=generator, device=self.device, dtype=torch.float64)
         parts = torch.arange(count, device=self.device, dtype=torch.float64)
         face = torch.searchsorted(self.cumulative_area, (parts + dice) / count)
-        return self._at(face.clamp(max=len(self.faces) - 1), weights)
+        return face.clamp(max=len(self.faces) - 1)
 
     def with_jacobian(
         self, count: int, boundary_every: int, generator: torch.Generator
@@ -86,9 +90,12 @@ class SurfaceSampler:
         has no area in Ω in single precision.
 
         The first of every ``boundary_every`` points is on the mesh's boundary, uniform by length;
-        the others are uniform by area. On a closed domain all are.
+        the others are uniform by area, and spread evenly. On a closed domain all are. Their order
+        is random.
         """
-        face, weights = self._places(count, generator)
+        weights = self._weights(count, generator)
+        order = torch.randperm(count, generator=generator, device=self.device)
+        face = self._one_in_each_part(count, generator)[order]
         if self.has_boundary:
             on = slice(None, None, boundary_every)
             face[on], weights[on] = self._boundary_places(len(face[on]), generator)
@@ -127,10 +134,13 @@ class SurfaceSampler:
         cumulative = self.cumulative_area if cumulative is None else cumulative
         dice = torch.rand(count, generator=generator, device=self.device, dtype=torch.float64)
         face = torch.searchsorted(cumulative, dice).clamp(max=len(self.faces) - 1)
+        return face, self._weights(count, generator)
+
+    def _weights(self, count: int, generator: torch.Generator) -> Tensor:
+        """Barycentric weights (count, 3) of points that are uniform in their triangles."""
         r = torch.rand(count, 2, generator=generator, device=self.device)
         root = r[:, 0].sqrt()
-        weights = torch.stack([1 - root, root * (1 - r[:, 1]), root * r[:, 1]], dim=1)
-        return face, weights
+        return torch.stack([1 - root, root * (1 - r[:, 1]), root * r[:, 1]], dim=1)
 
     def _at(self, face: Tensor, weights: Tensor) -> Samples:
         corners = self.faces[face]

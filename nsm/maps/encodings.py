@@ -328,6 +328,10 @@ class SplineGrid(nn.Module):
         blend = torch.stack([(u[0, :, None] * v[1, None]).flatten(0, 1) for u, v in pairs])
         return rows[0].t(), blend.transpose(1, 2)
 
+    def first_row(self, x: Tensor, level: int) -> Tensor:
+        """The first row (N,) of a level's table that each of points (N, 2) sees."""
+        return self._seen(x, self.resolutions[level : level + 1])[0][0, 0]
+
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""
         if transformed():

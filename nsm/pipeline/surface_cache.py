@@ -34,7 +34,7 @@ from nsm.sweeps import is_complete
 from nsm.tasks.ensemble import EnsembleSplit
 
 # to be raised when the same settings come to make another neural surface
-_VERSION = 3
+_VERSION = 4
 
 # settings that make a neural surface what it is; those of the trainer but for how it is run
 _ESSENTIAL = (

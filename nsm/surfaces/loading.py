@@ -17,9 +17,11 @@ import numpy as np
 
 from nsm.errors import NsmError
 from nsm.surfaces.obj import read_obj, text_of
+from nsm.surfaces.recent import Recent, content
 
 _LONGEST_HEADER = 100_000  # bytes
 LARGEST_FILE = 4 * 2**30  # bytes
+_READ = Recent()
 EXTENSIONS = (".obj", ".ply", ".off", ".stl", ".gltf", ".glb")
 
 
@@ -63,7 +65,7 @@ def check_file(file: Path, largest: int, endings: Sequence[str] = ()) -> None:
 
 
 def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Read a mesh file.
+    """Read a mesh file; the latest that were read are remembered by their content.
 
     Returns:
         Vertices (V, 3) float64 in the order and units of the file, triangles (F, 3) int64, and one
@@ -76,6 +78,17 @@ def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     file = Path(path)
     suffix = file.suffix.lower()
     check_file(file, LARGEST_FILE, EXTENSIONS)
+    # .gltf is left out: its arrays may be in files of their own
+    if suffix == ".gltf" or file.stat().st_size > _READ.most_bytes:
+        return _read(file, suffix)
+    try:
+        key = (str(file), content(file.read_bytes()))
+    except OSError:
+        return _read(file, suffix)  # which says what is wrong
+    return _READ.get(key, lambda: _read(file, suffix))
+
+
+def _read(file: Path, suffix: str) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     reader = {".obj": _read_obj, ".off": _read_off, ".ply": _read_ply}.get(suffix, _read_trimesh)
     try:
         vertices, faces, log = reader(file)

@@ -20,6 +20,7 @@ from nsm.surfaces.cutting import first_copies
 from nsm.surfaces.degenerate import distinct_corners, first_uses, without_degenerate
 from nsm.surfaces.holes import fill
 from nsm.surfaces.loading import as_arrays, check_arrays, error_in
+from nsm.surfaces.recent import Recent, content
 
 # Connected components below these shares of the area (each, and all together) are debris or
 # trimmings, such as eyeballs behind a face, and are removed. If others are larger, the user must
@@ -53,6 +54,7 @@ class Repairs:
 
 
 NO_DECISION = Repairs()
+_CLEANED = Recent()
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class CleanMesh:
 def clean(
     vertices: np.ndarray, faces: np.ndarray, name: str = "mesh", repairs: Repairs = NO_DECISION
 ) -> CleanMesh:
-    """Make all repairs that keep the shape.
+    """Make all repairs that keep the shape; the latest meshes are remembered by their content.
 
     Args:
         vertices: (W, 3).
@@ -101,6 +103,11 @@ def clean(
     """
     vertices, faces = as_arrays(vertices, faces, name)
     check_arrays(vertices, faces, name)
+    key = (name, repairs, content(vertices, faces))
+    return _CLEANED.get(key, lambda: _cleaned(vertices, faces, name, repairs))
+
+
+def _cleaned(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: Repairs) -> CleanMesh:
     _check_size(vertices, faces, name)
     log: list[str] = []
     representative = _weld_duplicates(vertices, faces, log)

@@ -105,6 +105,20 @@ def test_one_of_so_many_samples_is_on_the_boundary_by_length(uneven):
         assert any(met[list(face)].all() for face in uneven.faces)
 
 
+def test_samples_of_a_fit_are_spread_over_the_faces_evenly_and_in_random_order(uneven):
+    boundary_every = 1 << 30  # the first alone
+    sampler = SurfaceSampler(uneven)
+    count = 2000
+    uv = sampler.with_jacobian(count, boundary_every, sampler.generator(4))[0].uv[1:].numpy()
+    inside = uneven.domain.locate(uv, uneven.uv, uneven.faces).face
+    wanted = count * sampler.cumulative_area.diff(prepend=torch.zeros(1, dtype=torch.float64))
+    met = np.bincount(inside, minlength=len(uneven.faces))
+    # each part of equal area has its point: only the first and last of a face's may be another's
+    assert np.abs(met - wanted.numpy()).max() <= 3
+    half = np.bincount(inside[: count // 2], minlength=len(uneven.faces))
+    assert np.abs(half - wanted.numpy() / 2).max() < 4 * np.sqrt(wanted.max())
+
+
 def test_jacobians_are_finite_where_single_precision_loses_a_triangle(uneven):
     uv = uneven.uv.copy()
     uv[uneven.faces[0]] = uv[uneven.faces[0, 0]] + np.array([[0, 0], [1e-12, 0], [0, 1e-12]])

@@ -91,9 +91,9 @@ def steps_of(*words, overrides=()):
 
 
 def test_maps_may_take_the_fit_alone():
-    alone, few, whole = (steps_of(*words) for words in (["phi.steps=0"], ["phi.steps=250"], []))
-    assert alone[0] == 0 and few[0] == 250
-    assert whole[0] == compose_config(["task=overfit"]).trainer.max_steps > 250
+    alone, few, whole = (steps_of(*words) for words in (["phi.steps=0"], ["phi.steps=100"], []))
+    assert alone[0] == 0 and few[0] == 100
+    assert whole[0] == compose_config(["task=overfit"]).trainer.max_steps > 100
     assert len({alone[1], few[1], whole[1]}) == 3  # apart in the cache
     assert steps_of("phi.steps=0", overrides=["trainer.max_steps=70"])[0] == 70
 

@@ -9,11 +9,13 @@ from nsm.config import compose_config
 from nsm.domains import Surface
 from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
+from nsm.maps import LatticeSplineGrid
 from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
 from nsm.maps.networks import build_network
 from nsm.pipeline import built, make_task
 from nsm.results import pointwise_metrics
-from nsm.tasks.least_squares import _fit_tables, fit_linear_skip
+from nsm.tasks.least_squares import _SMOOTH, _fit_tables, _on_lattice, fit_linear_skip
+from nsm.tasks.multigrid import folding
 from nsm.tasks.planar import planar_map
 
 GRID = {"_target_": "nsm.maps.encodings.SplineGrid", "resolutions": [4, 8], "features": 3}
@@ -80,6 +82,37 @@ def test_a_spline_of_the_grid_is_found_again(monkeypatch):
         stack = value_and_jacobian_stack(found, uv) @ linear_skip.weight.t()
         stack[0] += linear_skip.bias
     torch.testing.assert_close(stack, target.float(), rtol=0, atol=5e-3)
+
+
+@pytest.mark.parametrize("even", [True, False])
+@pytest.mark.parametrize("cells", [(4, 4), (6, 8)])
+def test_the_system_of_a_closed_domain_is_that_of_all_samples_written_out(cells, even):
+    """Dense: each sample's row, and second differences around the whole period."""
+    grid = LatticeSplineGrid([cells], 3, even)
+    random = torch.Generator().manual_seed(0)
+    uv = 4 * torch.rand(300, 2, generator=random) - 2
+    along = torch.randn(2, 2, len(uv), generator=random)
+    target = torch.randn(3, 3, len(uv), generator=random)
+    matrix, right = _on_lattice(grid, 0, uv.t(), along, target)
+
+    rows, weights = grid.seen(uv, 0)
+    slopes = torch.einsum("knt,kjn->jnt", weights[1:], along)  # along two directions
+    design = torch.zeros(3, len(uv), len(grid.tables[0]))
+    for order, value in enumerate((weights[0], *slopes)):
+        design[order].scatter_add_(1, rows, value)
+    design = design.flatten(0, 1).double()
+    expected = (design.t() @ design).numpy()
+    n, m = cells
+    fold = folding(grid, n, m).toarray().reshape(n, m, -1)
+    for axis in (0, 1):
+        bend = np.roll(fold, 1, axis) - 2 * fold + np.roll(fold, -1, axis)
+        bend = bend.reshape(n * m, -1)
+        share = len(expected) / (n * m)
+        weight = _SMOOTH * np.diag((design.t() @ design).numpy()).mean()
+        expected = expected + weight * share * bend.T @ bend
+    wanted = design.t() @ target.transpose(1, 2).flatten(0, 1).double()
+    np.testing.assert_allclose(matrix.toarray(), expected, rtol=1e-4, atol=1e-4 * weight)
+    np.testing.assert_allclose(right, wanted.numpy(), rtol=1e-4, atol=1e-3)
 
 
 def test_a_curved_surface_is_met_before_any_training():

@@ -23,6 +23,7 @@ _EXTREMITIES = 6
 _CLOSE = 0.12  # of the largest distance: two extremities nearer than this are one
 _SOURCES = 96
 _FINALISTS = 2
+_LEAST = float(np.log(2 + 2 / 1.01))  # score of an isometry; ε of METHOD's energy is 0.01
 _QUICK = Effort(coarse=_FEW, level=3, last=6, stop=1e-3)
 _LONGER = Effort(level=3, last=8, stop=1e-3)
 
@@ -142,13 +143,14 @@ def compared(
 ) -> list[tuple[float, np.ndarray, list[np.ndarray]]]:
     """Sets of four candidates, by the mean of the meshes' scores, best first.
 
-    All are laid out on a few hundred faces.
+    All are laid out on a few hundred faces, but those that one mesh excludes already.
 
     Args:
         meshes: (V, 3) and (F, 3) of each.
         candidates: (K,) corresponding vertices of each.
         sets: which candidates (4,) each has.
-        again: lay the two best out again on about 3,000 faces, and return these.
+        again: lay the two best out again on about 3,000 faces, and return these; without it, only
+            the best set is sure to be among the results.
 
     Returns:
         of each set the mean score, the set, and the meshes' lattices (2, 2).
@@ -157,38 +159,61 @@ def compared(
     found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
     for count, effort in (few, many) if again and len(sets) > 1 else (few,):
         each = [
-            _scored(*mesh, ids, sets, count, effort)
+            _Candidates(*mesh, ids, count, effort)
             for mesh, ids in zip(meshes, candidates, strict=True)
         ]
-        found = [
-            (float(np.mean([s for s, _ in one])), four, [lattice for _, lattice in one])
-            for four, one in zip(sets, zip(*each, strict=True), strict=True)
-        ]
-        found.sort(key=lambda way: way[0])
+        found = _best(each, sets, _FINALISTS if again else 1)
         sets = [four for _, four, _ in found[:_FINALISTS]]
     return found
 
 
-def _scored(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    candidates: np.ndarray,
-    sets: Sequence[np.ndarray],
-    count: int,
-    effort: Effort,
-) -> list[tuple[float, np.ndarray]]:
-    coarse, ids = decimated(vertices, faces, count, candidates)
-    local, points = np.searchsorted(ids, candidates), vertices[ids]
-    held = np.zeros(len(ids), dtype=bool)
-    held[local] = True
-    levels = hierarchy(points, coarse, held, effort)
-    scores = []
-    for four in sets:
+def _best(
+    each: Sequence[_Candidates], sets: Sequence[np.ndarray], wanted: int
+) -> list[tuple[float, np.ndarray, list[np.ndarray]]]:
+    """As :func:`compared`, of meshes with their candidates; the ``wanted`` best are sure to be
+    among the results."""
+    first = [each[0].score(four) for four in sets]
+    found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
+    for k in np.argsort([score for score, _ in first], kind="stable").tolist():
+        ways = [first[k]]
+        limit = sorted(score for score, _, _ in found)[wanted - 1 : wanted]
+        for mesh in each[1:]:
+            total = sum(score for score, _ in ways) + _LEAST * (len(each) - len(ways))
+            if limit and total >= limit[0] * len(each):
+                break
+            ways.append(mesh.score(sets[k]))
+        else:
+            mean = float(np.mean([score for score, _ in ways]))
+            found.append((mean, sets[k], [lattice for _, lattice in ways]))
+    return sorted(found, key=lambda way: way[0])
+
+
+class _Candidates:
+    """Candidates for cones (K,) of a mesh (V, 3), (F, 3) that is drawn together to ``count`` faces
+    once, for all sets of them."""
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        candidates: np.ndarray,
+        count: int,
+        effort: Effort,
+    ) -> None:
+        self.faces, ids = decimated(vertices, faces, count, candidates)
+        self.vertices, self.effort = vertices[ids], effort
+        self.candidates = np.searchsorted(ids, candidates)
+        held = np.zeros(len(ids), dtype=bool)
+        held[self.candidates] = True
+        self.levels = hierarchy(self.vertices, self.faces, held, effort)
+
+    def score(self, four: np.ndarray) -> tuple[float, np.ndarray]:
+        """As :func:`score`, with the cones at four candidates; infinite if there is no layout."""
+        cones = self.candidates[four]
         try:
-            scores.append(score(points, coarse, local[four], effort, levels))
+            return score(self.vertices, self.faces, cones, self.effort, self.levels)
         except NsmError:  # squeezed below what digits hold
-            scores.append((np.inf, np.eye(2)))
-    return scores
+            return np.inf, np.eye(2)
 
 
 def _four_apart(vertices: np.ndarray, faces: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from domains.orbifold.shapes import hull, limbs
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.certificate import certificate, torn_edges
 from nsm.domains.orbifold.collapses import collapsed
+from nsm.domains.orbifold.cones import compared
 from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, laid_out, scaled
 from nsm.domains.orbifold.newton import Quotient, distortions
@@ -166,3 +169,18 @@ def test_long_limbs_that_tutte_squeezes_are_recovered() -> None:
     x = np.linalg.solve(layout.lattice, layout.uv.T).T
     x[cones] = group.CONES
     assert certificate(faces, layout.lift, x, cones).injective
+
+
+def test_sets_of_cones_that_one_mesh_excludes_change_nothing() -> None:
+    """The best set is the best of all, each laid out on all meshes."""
+    points, faces, tips = limbs()
+    bent = points * [1.3, 0.9, 1.0] + 0.2 * np.sin(points[:, [1, 2, 0]])
+    own = np.array([*tips, points[:, 2].argmin(), points[:, 2].argmax()])
+    sets = [np.array(four) for four in combinations(range(len(own)), 4)][:4]
+    meshes = [(points, faces), (bent, faces)]
+    mean, best, _ = compared(meshes, [own, own], sets, again=False)[0]
+    every = [
+        [compared([mesh], [own], [four], again=False)[0][0] for mesh in meshes] for four in sets
+    ]
+    assert mean == pytest.approx(np.mean(every, axis=1).min(), rel=1e-9)
+    assert (best == sets[int(np.mean(every, axis=1).argmin())]).all()
