@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from nsm.domains.orbifold.collection_alignment import alignments_to_first, disag
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.collection_inputs import collected
+from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_landmarks
 from nsm.pipeline.landmark_inputs import name_of
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
@@ -37,6 +39,7 @@ from nsm.results import (
     figures_picture,
     map_image,
     transfer_matrix_picture,
+    warning_of_distortion,
     warning_of_tears,
     write_correspondences,
 )
@@ -74,6 +77,7 @@ class CollectionMapTask(Task):
     has_template = False  # the first surface is one
     template_mesh: Mesh | None = None  # of its file
     proposed: ProposedLandmarks | None = None
+    check: LandmarkCheck | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -108,7 +112,9 @@ class CollectionMapTask(Task):
             self.console,
             template=self.has_template,
         )
-        self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
+        self.check = check_landmarks(shapes, ids, self.console)
+        draw = partial(draw_landmarks, self.folder, landmarks=ids)
+        self.use(neural_surfaces(self.config, shapes, ids, self.console, draw), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
         """Take the surfaces, and the landmarks as vertices (L,) of their mesh files."""
@@ -233,6 +239,7 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+        result.metrics.update({} if self.check is None else self.check.figures)
         for (i, j), name in result.pair_names.items():
             figures = result.metrics["pairs"][name]
             source, target = self.phis[i].surface, self.phis[j].surface
@@ -246,8 +253,13 @@ class CollectionMapTask(Task):
             figures |= start_figures(source, target, first, places, end)
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
-        every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
-        return [torn for torn in every if torn is not None]
+        pairs = result.metrics["pairs"]
+        found = (
+            None if self.check is None else self.check.warning,
+            warning_of_distortion(pairs),
+            *(warning_of_tears(name, of) for name, of in pairs.items()),
+        )
+        return [warning for warning in found if warning is not None]
 
     def figures(self, result: SurfaceCollection) -> dict[str, Any]:
         said = {"surfaces": result.names, "landmarks": len(self.ids[0])}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.landmark_check import warn_of_landmarks
+from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_landmarks
 from nsm.pipeline.parts import closed_parts
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
@@ -43,12 +44,12 @@ from nsm.results import (
     pair_table,
     reliability_picture,
     transfer_picture,
+    warning_of_distortion,
     warning_of_tears,
     write_correspondences,
     write_reliability,
 )
 from nsm.results.file_faces import faces_of_file
-from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
@@ -84,6 +85,7 @@ class PairMapTask(Task):
     attributes: dict[str, np.ndarray]
     textures: Textures | None = None
     proposed: ProposedLandmarks | None = None
+    check: LandmarkCheck | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         ends = (("source", given.source), ("target", given.target))
@@ -104,11 +106,12 @@ class PairMapTask(Task):
         shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
-        warn_of_landmarks(shapes, ids, self.console)
+        self.check = check_landmarks(shapes, ids, self.console)
         self.attributes = read_attributes(settings["attributes"], counts)
         repairs = configured_repairs(self.config)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
-        phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
+        draw = partial(draw_landmarks, self.folder, landmarks=ids)
+        phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw)
         self.use(phi, psi, ids)
 
     def use(self, phi: NeuralSurface, psi: NeuralSurface, ids: Sequence[np.ndarray]) -> None:
@@ -241,6 +244,7 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        result.metrics.update({} if self.check is None else self.check.figures)
         if self.trained is not None:
             before = flipped_percent(self.trained.image_uv[source.of_part], source.part.faces)
             result.metrics["flipped_before_repair_percent"] = before
@@ -251,8 +255,12 @@ class PairMapTask(Task):
 
     def warnings(self, result: SurfaceMap) -> list[Text]:
         name = f"{self.surface.name} → {self.psi.surface.name}"
-        torn = warning_of_tears(name, result.metrics)
-        return [] if torn is None else [torn]
+        found = (
+            None if self.check is None else self.check.warning,
+            warning_of_distortion({name: result.metrics}),
+            warning_of_tears(name, result.metrics),
+        )
+        return [warning for warning in found if warning is not None]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
         said: dict[str, Any] = {
@@ -295,10 +303,6 @@ class PairMapTask(Task):
         if self.textures is not None:
             for line in write_textured(self.textures, folder, result, self.config.texture_size):
                 self.console.print(line)
-
-    def write_inputs(self, folder: Path) -> None:
-        if len(self.ids[0]):
-            landmarks_picture(folder / "landmarks.png", [self.surface, self.psi.surface], self.ids)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
