@@ -48,6 +48,7 @@ from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, export_ply, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
+from nsm.stages import at, counted, stage
 from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import (
@@ -92,10 +93,11 @@ class CollectionMapTask(Task):
         if given.surfaces is None:  # those that match a pattern now
             self.config.surfaces = surfaces if template is None else surfaces[1:]
         self.keep_absolute("surfaces", "template", "landmarks")
-        shapes = [
-            read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
-            for k, surface in enumerate(surfaces)
-        ]
+        with stage(self.console, f"{self.name}: reading"):
+            shapes = [
+                read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
+                for k, surface in enumerate(surfaces)
+            ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
         if landmarks is None:
             landmarks = files_beside(surfaces, [name_of(shape) for shape in shapes])
@@ -147,8 +149,10 @@ class CollectionMapTask(Task):
         surfaces = [phi.surface for phi in self.phis]
         if not self.domain.has_boundary:
             common = self.ids if targets.shape[1] else None
-            to_first = alignments_to_first(surfaces, common)
-            for pair in disagreements(surfaces, to_first, common):
+            with stage(self.console, f"{self.title}: isotopy classes"):
+                to_first = alignments_to_first(surfaces, common)
+                unlike = disagreements(surfaces, to_first, common)
+            for pair in unlike:
                 ends = f"{surfaces[pair.source].name} → {surfaces[pair.target].name}"
                 self.console.print(
                     f"{ends}: the isotopy class that follows from the other pairs scores "
@@ -284,13 +288,17 @@ class CollectionMapTask(Task):
             (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
-        figures_picture(folder / "figures.png", result)
-        transfer_matrix_picture(folder / "transfer.png", result)
-        cycle_picture(folder / "cycle.png", result)
+        for name, draw in (
+            ("figures.png", figures_picture),
+            ("transfer.png", transfer_matrix_picture),
+            ("cycle.png", cycle_picture),
+        ):
+            at(name)
+            draw(folder / name, result)
         names = [re.sub(r"[/\\]", "_", name) for name in result.names]
-        for i, j in itertools.permutations(range(len(result)), 2):
-            if self.has_template and 0 not in (i, j):
-                continue
+        pairs = list(itertools.permutations(range(len(result)), 2))
+        kept = [ends for ends in pairs if 0 in ends or not self.has_template]
+        for i, j in counted("pairs written", kept):
             f = result.pair(i, j)
             self._write_pair(folder / f"{names[i]}_to_{names[j]}", f)
             if self.has_template and i == 0:

@@ -55,6 +55,7 @@ from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.results.pair_pictures import normals_picture
+from nsm.stages import at, stage
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
@@ -95,11 +96,12 @@ class PairMapTask(Task):
         self.keep_absolute("source", "target", "landmarks", "attributes", "texture")
         settings = self.settings
         ends = self.inputs(given)
-        shapes = [
-            read_shape(end, self.domain, key, self.config.trust)
-            for key, end in zip(("source", "target"), ends, strict=True)
-        ]
-        self.textures = read_textures(settings["texture"], ends, shapes)
+        with stage(self.console, f"{self.name}: reading"):
+            shapes = [
+                read_shape(end, self.domain, key, self.config.trust)
+                for key, end in zip(("source", "target"), ends, strict=True)
+            ]
+            self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
         of_files = self.textures is not None or any(settings["attributes"].values())
         counts = [vertex_count(shape) for shape in shapes]
@@ -124,7 +126,8 @@ class PairMapTask(Task):
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
-            self.alignments = alignments(phi.surface.part, psi.surface, common)
+            with stage(self.console, f"{self.title}: isotopy classes"):
+                self.alignments = alignments(phi.surface.part, psi.surface, common)
             scores = ", ".join(f"{one.score:.3f}" for one in self.alignments[:_CLASSES_SHOWN])
             self.console.print(f"likely isotopy classes, best first: scores {scores}")
 
@@ -313,16 +316,21 @@ class PairMapTask(Task):
             "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
         for name, mesh in meshes.items():
+            at(name)
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
         write_correspondences(folder / "correspondences.npz", f)
+        at("reliability")
         write_reliability(folder / "reliability.ply", f)
         reliability_picture(folder / "reliability.png", f)
-        _write_morph(folder, f, self.console)
+        at("transfer.png")
         transfer_picture(folder / "transfer.png", f)
+        at("distortion.png")
         distortion_picture(folder / "distortion.png", f)
         if isinstance(f.target.map, AnalyticSurface):
             normals_picture(folder / "normals.png", f)
+        at("morph")
+        _write_morph(folder, f, self.console)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
 
 

@@ -81,7 +81,8 @@ def run_task(
         check_device(config)
         check_packages(config.logger)
         task.folder = folder if config.artefacts else None
-        task.choose_domain(given or Given())
+        with stage(console, f"{task.name}: reading"):
+            task.choose_domain(given or Given())
         task.prepare(given or Given())
         run = Run(config, folder, resuming)
         parts = task.parts()

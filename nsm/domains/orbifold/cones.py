@@ -13,6 +13,7 @@ from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.errors import NsmError
+from nsm.stages import counted
 from nsm.surfaces import topology
 from nsm.surfaces.geometry import edge_graph
 
@@ -156,9 +157,10 @@ def compared(
     few, many = (_FEW, _QUICK), (_FACES, _LONGER)
     found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
     for count, effort in (few, many) if again and len(sets) > 1 else (few,):
+        pairs = list(zip(meshes, candidates, strict=True))
         each = [
             _scored(*mesh, ids, sets, count, effort)
-            for mesh, ids in zip(meshes, candidates, strict=True)
+            for mesh, ids in counted(f"cones tried on {count} faces", pairs)
         ]
         found = [
             (float(np.mean([s for s, _ in one])), four, [lattice for _, lattice in one])
