@@ -159,7 +159,7 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
     return table
 
 
-_WIDEST = 6  # characters of a figure in a narrow table
+_WIDEST = 5  # characters of a figure in a narrow table
 
 
 def _brief(figures: Mapping[str, float], key: str) -> str:
@@ -167,7 +167,7 @@ def _brief(figures: Mapping[str, float], key: str) -> str:
     if key not in figures:
         return "–"
     value = figures[key]
-    return f"{value:.3f}" if abs(value) < 10 else f"{value:#.4g}"[:_WIDEST].rstrip(".")
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:#.4g}"
 
 
 def _narrow(first: str, headings: Iterable[str]) -> Table:
