@@ -102,9 +102,9 @@ def islands_as_given(
                 "mirrored in the texture coordinates: turned over, to be seen from outside"
             )
         if not topology.is_disc(part):
-            laid, part, inner, holes, edges = _opened(laid, part, name)
+            laid, part, inner, holes, cuts = _opened(laid, part, name)
             origin = origin[inner]
-            lines.append(f"{holes} holes in the texture coordinates, cut open along {edges} edges")
+            lines.append(f"{holes} holes in the texture coordinates, cut open along {cuts} edges")
         _check(laid, part, name)
         both, part, inserted = split_chords(np.hstack([mesh.vertices[origin], laid]), part)
         origin = np.concatenate([origin, np.full(inserted, -1)])
