@@ -88,7 +88,7 @@ def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None)
                     del running[receiver]
                     steps.pop(number, None)
                     (results if kind == _DONE else failures)[number] = value
-                at("; ".join(steps[k] for k in sorted(steps)))
+                at("; ".join(steps[k] for k in sorted(steps) if steps[k]))
             # a call before the one that failed might fail too: it is the one to report
             if failures and all(number > min(failures) for number, _ in running.values()):
                 break

@@ -305,7 +305,7 @@ class PairMapTask(Task):
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
         if self.textures is not None:
             for line in write_textured(self.textures, folder, result, self.config.texture_size):
-                self.console.print(line)
+                self.console.print(line, soft_wrap=True)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
