@@ -171,9 +171,9 @@ def _brief(figures: Mapping[str, float], key: str) -> str:
 
 
 def _narrow(first: str, headings: Iterable[str]) -> Table:
-    """A table whose headings break between words, to fit a terminal of 80 columns."""
+    """A table whose headings, and names of rows, break between words, to fit a terminal of 80
+    columns; figures do not."""
     table = Table(first, padding=(0, 1, 0, 0))
-    table.columns[0].no_wrap = True
     for heading in headings:
         table.add_column(heading, width=max(_WIDEST, *map(len, heading.split())))
     return table
