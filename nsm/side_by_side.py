@@ -36,10 +36,19 @@ def at_once(count: int, processes: int | None) -> int:
     """How many of ``count`` calls run at once, where so many processes are allowed (None: as many
     as there are cores). One where the system cannot fork safely, or in a process that may not have
     children."""
-    can_fork = hasattr(os, "fork") and sys.platform != "darwin"
-    if not can_fork or multiprocessing.current_process().daemon:
-        return 1
-    return min(count, processes or cores())
+    return min(count, processes or cores()) if _can_fork() else 1
+
+
+def _can_fork() -> bool:
+    there = hasattr(os, "fork") and sys.platform != "darwin"
+    return there and not multiprocessing.current_process().daemon
+
+
+def apart(call: Callable[[], T]) -> T:
+    """The result of a call in a process of its own, where there can be one: this one can be
+    interrupted meanwhile, and shows that the work goes on, whatever library holds the interpreter
+    there. Errors as for :func:`side_by_side`."""
+    return _in_processes([call], 1)[0] if _can_fork() else call()
 
 
 def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None) -> list[T]:
@@ -59,8 +68,11 @@ def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None)
         NsmError: ``failed_process``: a process was killed.
     """
     most = at_once(len(calls), processes)
-    if most < 2:
-        return [call() for call in calls]
+    return [call() for call in calls] if most < 2 else _in_processes(calls, most)
+
+
+def _in_processes(calls: Sequence[Callable[[], T]], most: int) -> list[T]:
+    """As :func:`side_by_side`, at most so many at once, each in a process."""
     context = multiprocessing.get_context("fork")
     waiting = deque(enumerate(calls))
     running: dict[Connection, tuple[int, BaseProcess]] = {}
