@@ -40,6 +40,7 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_distortion,
+    warning_of_missed_landmarks,
     warning_of_tears,
     write_correspondences,
 )
@@ -261,6 +262,7 @@ class CollectionMapTask(Task):
         found = (
             None if self.check is None else self.check.warning,
             warning_of_distortion(pairs),
+            warning_of_missed_landmarks(pairs),
             *(warning_of_tears(name, of) for name, of in pairs.items()),
         )
         return [warning for warning in found if warning is not None]

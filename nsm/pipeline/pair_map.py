@@ -45,6 +45,7 @@ from nsm.results import (
     reliability_picture,
     transfer_picture,
     warning_of_distortion,
+    warning_of_missed_landmarks,
     warning_of_tears,
     write_correspondences,
     write_reliability,
@@ -261,6 +262,7 @@ class PairMapTask(Task):
         found = (
             None if self.check is None else self.check.warning,
             warning_of_distortion({name: result.metrics}),
+            warning_of_missed_landmarks({name: result.metrics}),
             warning_of_tears(name, result.metrics),
         )
         return [warning for warning in found if warning is not None]

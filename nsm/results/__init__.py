@@ -35,6 +35,7 @@ from nsm.results.tables import (
     metrics_table,
     pair_table,
     warning_of_distortion,
+    warning_of_missed_landmarks,
     warning_of_tears,
 )
 from nsm.results.textured_mesh import TexturedMesh
@@ -68,6 +69,7 @@ __all__ = [
     "pair_table",
     "transfer_picture",
     "warning_of_distortion",
+    "warning_of_missed_landmarks",
     "warning_of_tears",
     "NeuralSurface",
     "Parameterization",

@@ -61,6 +61,8 @@ _TORN = 1.0
 # median symmetric Dirichlet of lengths stretched by 2.4 one way and shrunk as much the other. Maps
 # of the animals, busts and a plane and bird have 7 at most, those by wrong landmarks 13 and more
 _DISTORTED = 12.0
+# percent of the diagonal by which a landmark may miss its place before it is said
+_MISSED = 5.0
 
 _PAIR_ROWS = {
     "symmetric_dirichlet_median": (
@@ -116,11 +118,9 @@ def warning_of_distortion(maps: Mapping[str, Mapping[str, float]]) -> Text | Non
         maps: the figures of :func:`nsm.results.pair_metrics` of each, by its name.
     """
     key = "symmetric_dirichlet_median"
-    far = [name for name, of in maps.items() if of.get(key, 0.0) > _DISTORTED]
-    if not far:
+    which, worst = _beyond(maps, key, _DISTORTED)
+    if not which:
         return None
-    worst = max(far, key=lambda name: maps[name][key])
-    which = worst if len(maps) == 1 else f"{len(far)} of {len(maps)} maps, {worst} most"
     return Text(
         f"{which}: strongly distorted, median symmetric Dirichlet {maps[worst][key]:.1f} "
         f"({LEAST_SYMMETRIC_DIRICHLET} at best), 95th percentile "
@@ -128,6 +128,33 @@ def warning_of_distortion(maps: Mapping[str, Mapping[str, float]]) -> Text | Non
         "continuous and injective. Check the landmarks in landmarks.png, or give more of them",
         style="bold red",
     )
+
+
+def warning_of_missed_landmarks(maps: Mapping[str, Mapping[str, float]]) -> Text | None:
+    """A line in red, if a landmark goes far past its place; None if none does.
+
+    Args:
+        maps: as for :func:`warning_of_distortion`.
+    """
+    key = "landmark_error_max_percent"
+    which, worst = _beyond(maps, key, _MISSED)
+    if not which:
+        return None
+    return Text(
+        f"{which}: a landmark is missed by {maps[worst][key]:.1f} % of the diagonal "
+        f"({maps[worst]['landmark_error_mean_percent']:.1f} % in the mean): landmarks contradict "
+        "each other, or the training was too short",
+        style="bold red",
+    )
+
+
+def _beyond(maps: Mapping[str, Mapping[str, float]], key: str, most: float) -> tuple[str, str]:
+    """Which maps have a figure above ``most``, in words, and the worst of them; "" for none."""
+    far = [name for name, of in maps.items() if of.get(key, 0.0) > most]
+    if not far:
+        return "", ""
+    worst = max(far, key=lambda name: maps[name][key])
+    return worst if len(maps) == 1 else f"{len(far)} of {len(maps)} maps, {worst} most", worst
 
 
 _COLLECTION_COLUMNS = {

@@ -11,7 +11,7 @@ import nsm
 from nsm.correspondence import agreement
 from nsm.domains.joint_preparation import Mesh
 from nsm.pipeline.landmark_check import check_landmarks
-from nsm.results import warning_of_distortion
+from nsm.results import warning_of_distortion, warning_of_missed_landmarks
 from nsm.results.report.runs import find_runs
 from nsm.surfaces.shapes import hemisphere, ring_mesh, sphere
 
@@ -142,3 +142,11 @@ def test_a_map_that_is_far_from_isometric_is_told():
     assert "a → b" in warning_of_distortion({"a → b": bad}).plain
     several = warning_of_distortion({"a → b": good, "b → c": bad, "c → a": good}).plain
     assert "1 of 3" in several and "b → c" in several and "30.0" in several
+
+
+def test_a_missed_landmark_is_told():
+    off = {"landmark_error_max_percent": 40.0, "landmark_error_mean_percent": 11.0}
+    assert warning_of_missed_landmarks({"a → b": {}}) is None
+    assert warning_of_missed_landmarks({"a → b": {**off, "landmark_error_max_percent": 1}}) is None
+    said = warning_of_missed_landmarks({"a → b": {}, "b → a": off}).plain
+    assert "1 of 2 maps, b → a most" in said and "40.0 %" in said and "11.0 %" in said
