@@ -158,7 +158,7 @@ def by_nsm(
 
 def flattened(file: Path) -> dict[str, dict[str, float]]:
     """Figures of flattening a mesh, cut on the disc: nsm's, and libigl's SLIM on the same cut."""
-    from nsm.domains.baselines import slim
+    from nsm.domains.baselines import free_slim as slim
 
     phi = nsm.overfit(nsm.Surface.load(file), overrides=["trainer.max_steps=0"], progress=False)
     start = time.process_time()

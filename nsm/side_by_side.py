@@ -18,9 +18,11 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar, cast
 
 from nsm.errors import NsmError
+from nsm.stages import at, report_to
 
 T = TypeVar("T")
 _PATIENCE = 10.0  # seconds that an interrupted process has for its checkpoint
+_STEP, _DONE, _FAILED = range(3)  # what a process sends: what it is at, its result, its error
 
 
 def cores() -> int:
@@ -34,10 +36,19 @@ def at_once(count: int, processes: int | None) -> int:
     """How many of ``count`` calls run at once, where so many processes are allowed (None: as many
     as there are cores). One where the system cannot fork safely, or in a process that may not have
     children."""
-    can_fork = hasattr(os, "fork") and sys.platform != "darwin"
-    if not can_fork or multiprocessing.current_process().daemon:
-        return 1
-    return min(count, processes or cores())
+    return min(count, processes or cores()) if _can_fork() else 1
+
+
+def _can_fork() -> bool:
+    there = hasattr(os, "fork") and sys.platform != "darwin"
+    return there and not multiprocessing.current_process().daemon
+
+
+def apart(call: Callable[[], T]) -> T:
+    """The result of a call in a process of its own, where there can be one: this one can be
+    interrupted meanwhile, and shows that the work goes on, whatever library holds the interpreter
+    there. Errors as for :func:`side_by_side`."""
+    return _in_processes([call], 1)[0] if _can_fork() else call()
 
 
 def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None) -> list[T]:
@@ -57,13 +68,17 @@ def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None)
         NsmError: ``failed_process``: a process was killed.
     """
     most = at_once(len(calls), processes)
-    if most < 2:
-        return [call() for call in calls]
+    return [call() for call in calls] if most < 2 else _in_processes(calls, most)
+
+
+def _in_processes(calls: Sequence[Callable[[], T]], most: int) -> list[T]:
+    """As :func:`side_by_side`, at most so many at once, each in a process."""
     context = multiprocessing.get_context("fork")
     waiting = deque(enumerate(calls))
     running: dict[Connection, tuple[int, BaseProcess]] = {}
     results: dict[int, T] = {}
     failures: dict[int, BaseException] = {}
+    steps: dict[int, str] = {}  # what each is at
     how = signal.SIGINT
     try:
         while running or (waiting and not failures):
@@ -77,9 +92,15 @@ def side_by_side(calls: Sequence[Callable[[], T]], processes: int | None = None)
                 _start(process)
                 sender.close()  # if the process dies, which has the other one, waiting ends
             for receiver in [end for end in wait(list(running)) if isinstance(end, Connection)]:
-                number, process = running.pop(receiver)
-                succeeded, value = _received(receiver, process)
-                (results if succeeded else failures)[number] = value
+                number, process = running[receiver]
+                kind, value = _received(receiver, process)
+                if kind == _STEP:
+                    steps[number] = value
+                else:
+                    del running[receiver]
+                    steps.pop(number, None)
+                    (results if kind == _DONE else failures)[number] = value
+                at("; ".join(steps[k] for k in sorted(steps) if steps[k]))
             # a call before the one that failed might fail too: it is the one to report
             if failures and all(number > min(failures) for number, _ in running.values()):
                 break
@@ -99,15 +120,16 @@ def _start(process: BaseProcess) -> None:
 
 
 def _answer(call: Callable[[], Any], sender: Connection) -> None:
-    """Send back whether a call succeeded in the new process, and its result or error."""
+    """Send back what a call in the new process is at, and its result or error."""
     # another thread may have held the locks of the real ones at the fork
     sys.stdout = sys.stderr = io.StringIO()
+    report_to(lambda text: sender.send_bytes(pickle.dumps((_STEP, text))))
     try:
-        answer = pickle.dumps((True, call()))
+        answer = pickle.dumps((_DONE, call()))
     except KeyboardInterrupt:
         os._exit(130)
     except BaseException as error:
-        answer = pickle.dumps((False, _portable(error)))
+        answer = pickle.dumps((_FAILED, _portable(error)))
     sender.send_bytes(answer)
 
 
@@ -121,9 +143,12 @@ def _portable(error: BaseException) -> BaseException:
     return RuntimeError("".join(traceback.format_exception_only(type(error), error)).strip())
 
 
-def _received(receiver: Connection, process: BaseProcess) -> tuple[bool, Any]:
+def _received(receiver: Connection, process: BaseProcess) -> tuple[int, Any]:
+    """What a process sends; after its answer it has ended."""
     try:
-        answer: tuple[bool, Any] = pickle.loads(receiver.recv_bytes())
+        answer: tuple[int, Any] = pickle.loads(receiver.recv_bytes())
+        if answer[0] == _STEP:
+            return answer
     except EOFError:
         process.join()
         if process.exitcode == 130:
@@ -134,9 +159,8 @@ def _received(receiver: Connection, process: BaseProcess) -> tuple[bool, Any]:
             kind="failed_process",
             key="phi.processes",
         )
-        return False, reason
-    finally:
-        receiver.close()
+        answer = _FAILED, reason
+    receiver.close()
     process.join()
     return answer
 

@@ -1,64 +1,88 @@
-"""What a run is at while it does not train: stage, step and time left, never silent for long."""
+"""What a run is at: stage, step and time left, never silent for long."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
 
 from rich.console import Console
 
-# seconds without a line after which one is printed where there is no terminal; in long runs the
-# share of the time that has passed, so that a log stays short
-QUIET_FOR, QUIET_SHARE = 2.0, 0.02
+# seconds without a line after which one is printed where there is no terminal
+QUIET_FOR = 2.0
+_OFTEN = 0.2  # seconds between two updates of one line, or two reports of another process
 
 T = TypeVar("T")
 
 
 class Stage:
-    """A piece of work that is shown while it lasts.
+    """A piece of work, and pieces within it, and the step that the innermost is at.
 
     Args:
-        console: where to write; a line that is updated on a terminal, plain lines elsewhere.
         title: of the work.
     """
 
-    def __init__(self, console: Console, title: str) -> None:
-        self.console, self.title = console, title
-        self.step, self.done, self.total = "", 0, 0
+    def __init__(self, title: str = "") -> None:
+        self.titles = [title] if title else []
+        self.step, self.figures, self.done, self.total = "", "", 0, 0
         self.started = self.step_started = time.monotonic()
         self._ended = threading.Event()
 
-    def at(self, step: str, done: int = 0, total: int = 0) -> None:
-        """Say which step the work is at: the one after ``done`` of ``total``, if it is counted."""
-        if step != self.step:
+    def at(self, step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
+        """Say which step the work is at: the one after ``done`` of ``total``, if it is counted;
+        and figures that tell how it goes."""
+        if step != self.step or done < self.done:
             self.step_started = time.monotonic()
-        self.step, self.done, self.total = step, done, total
+        self.step, self.done, self.total, self.figures = step, done, total, figures
 
-    def text(self) -> str:
-        """Title, step, seconds, and the time left of a step that is counted."""
+    def text(self, seconds: bool = True) -> str:
+        """Titles, step, ``seconds`` so far, the time left of a step that is counted, figures."""
         now = time.monotonic()
-        parts = [self.title, self.step, f"{now - self.started:.0f} s"]
+        step = self.step
         if self.total:
-            parts[1] += f" {min(self.done + 1, self.total)}/{self.total}"
-            if self.done:
-                left = (now - self.step_started) / self.done * (self.total - self.done)
-                parts.append(f"about {left:.0f} s left")
-        return "  ".join(part for part in parts if part)
+            step += f" {min(self.done + 1, self.total)}/{self.total}"
+        parts = [*self.titles, step, f"{now - self.started:.0f} s" if seconds else ""]
+        if self.total and self.done:
+            left = (now - self.step_started) / self.done * (self.total - self.done)
+            parts.append(f"about {left:.0f} s left")
+        return "  ".join(part for part in (*parts, self.figures) if part)
 
-    def _show(self) -> None:
-        if self.console.is_terminal:
-            with self.console.status(self.text()) as status:
-                while not self._ended.wait(0.2):
+    def show(self, console: Console) -> None:
+        """Show it until it ends: a line that is updated on a terminal, plain lines elsewhere."""
+        if console.is_terminal:
+            with console.status(self.text()) as status:
+                while not self._ended.wait(_OFTEN):
                     status.update(self.text())
             return
-        wait = QUIET_FOR
-        while not self._ended.wait(wait * 0.8):  # 0.8: others may hold the interpreter
-            self.console.print(self.text(), soft_wrap=True)
-            wait = max(QUIET_FOR, QUIET_SHARE * (time.monotonic() - self.started))
+        while not self._ended.wait(QUIET_FOR * 0.8):  # 0.8: others may hold the interpreter
+            console.print(self.text(), soft_wrap=True)
+
+    def end(self) -> None:
+        """Stop showing it."""
+        self._ended.set()
+
+
+class _Reported(Stage):
+    """The work of a process, told to the one that started it.
+
+    Args:
+        send: takes a text.
+    """
+
+    def __init__(self, send: Callable[[str], None]) -> None:
+        super().__init__()
+        self.send, self.sent = send, 0.0
+
+    def at(self, step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
+        new = step != self.step
+        super().at(step, done, total, figures)
+        now = time.monotonic()
+        if new or now - self.sent > _OFTEN:
+            self.sent = now
+            self.send(self.text(seconds=False))
 
 
 _current: ContextVar[Stage | None] = ContextVar("stage", default=None)
@@ -66,30 +90,59 @@ _current: ContextVar[Stage | None] = ContextVar("stage", default=None)
 
 @contextmanager
 def stage(console: Console, title: str) -> Iterator[None]:
-    """Show that a piece of work goes on, for as long as it does. Within another, its title is
-    that one's step."""
-    outer = _current.get()
-    if outer is not None or console.quiet:
-        at(title)
-        yield
+    """Show that a piece of work goes on, as long as it does; within another, as a part of it."""
+    if console.quiet or showing():
+        with part(title):
+            yield
         return
-    shown = Stage(console, title)
+    shown = Stage(title)
     token = _current.set(shown)
-    thread = threading.Thread(target=shown._show, daemon=True)
+    thread = threading.Thread(target=shown.show, args=(console,), daemon=True)
     thread.start()
     try:
         yield
     finally:
-        shown._ended.set()
+        shown.end()
         thread.join()
         _current.reset(token)
 
 
-def at(step: str, done: int = 0, total: int = 0) -> None:
+@contextmanager
+def part(title: str) -> Iterator[None]:
+    """Name a part of the work that is shown, if there is any, for as long as it lasts."""
+    outer = _current.get()
+    if outer is None:
+        yield
+        return
+    before = outer.step, outer.done, outer.total
+    outer.titles.append(title)
+    outer.at("")
+    try:
+        yield
+    finally:
+        outer.titles.pop()
+        outer.at(*before)
+
+
+def report_to(send: Callable[[str], None]) -> None:
+    """Let this process, a copy of another, tell that one what it is at.
+
+    Args:
+        send: takes a text, of stages and step, whenever that changes; at most a few in a second.
+    """
+    _current.set(_Reported(send))
+
+
+def showing() -> bool:
+    """Whether a stage is shown."""
+    return _current.get() is not None
+
+
+def at(step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
     """Say which step the work is at (see :meth:`Stage.at`); without a stage, nothing happens."""
     shown = _current.get()
     if shown is not None:
-        shown.at(step, done, total)
+        shown.at(step, done, total, figures)
 
 
 def counted(step: str, items: Sequence[T]) -> Iterator[T]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nsm.errors import NotTrusted, NsmError
-from nsm.side_by_side import at_once, side_by_side
+from nsm.side_by_side import apart, at_once, side_by_side
 
 pytestmark = pytest.mark.skipif(at_once(2, 2) < 2, reason="processes cannot be forked here")
 
@@ -114,3 +114,12 @@ def test_an_interrupt_reaches_all(tmp_path):
 def test_how_many_at_once():
     assert at_once(3, 1) == 1 and at_once(1, 8) == 1 and at_once(3, 2) == 2
     assert 1 <= at_once(100, None) <= os.cpu_count()
+
+
+def test_one_call_runs_apart():
+    """Its result and error come back; the thread that shows the work is not held up meanwhile."""
+    assert apart(lambda: os.getpid()) != os.getpid()
+    with pytest.raises(NsmError) as caught:
+        apart(failing(NsmError("no", kind="missing_file", key="a.obj")))
+    assert (caught.value.kind, caught.value.key) == ("missing_file", "a.obj")
+    assert not children()

@@ -1,12 +1,16 @@
 """What a run shows while it does not train."""
 
 import io
+import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from nsm import stages
+from nsm.results.progress import TrainingProgress
+from nsm.side_by_side import at_once, side_by_side
 
 
 @pytest.fixture
@@ -50,3 +54,64 @@ def test_an_exception_ends_it_and_steps_outside_are_ignored(often):
     stages.at("nothing")
     time.sleep(0.2)
     assert console.file.getvalue() == written
+
+
+def test_parts_are_named_and_the_step_before_them_comes_back():
+    shown = stages.Stage("outer")
+    token = stages._current.set(shown)
+    try:
+        stages.at("pairs", 1, 4)
+        with stages.part("inner"):
+            stages.at("flips", 2, 3, figures="loss 1")
+            assert shown.text(seconds=False) == "outer  inner  flips 3/3  about 0 s left  loss 1"
+        assert shown.text(seconds=False).startswith("outer  pairs 2/4")
+    finally:
+        stages._current.reset(token)
+    with stages.part("nothing is shown"):
+        assert not stages.showing()
+
+
+def test_lines_keep_coming_however_long_it_lasts(often):
+    console = Console(file=io.StringIO())
+    begun = stages.Stage("long")
+    begun.started -= 3600
+    end = time.monotonic() + 20
+    thread = threading.Thread(target=begun.show, args=(console,))
+    thread.start()
+    while console.file.getvalue().count("\n") < 5 and time.monotonic() < end:
+        time.sleep(0.02)
+    begun.end()
+    thread.join()
+    assert console.file.getvalue().count("\n") >= 5
+
+
+@pytest.mark.skipif(at_once(2, 2) < 2, reason="processes cannot be forked here")
+def test_other_processes_say_what_they_are_at(often):
+    console = Console(file=io.StringIO(), width=200)
+
+    def work(name):
+        with stages.stage(Console(quiet=True), name):
+            for _ in stages.counted("cells", range(4)):
+                time.sleep(0.2)
+        return name
+
+    with stages.stage(console, "all"):
+        assert side_by_side([lambda: work("a"), lambda: work("b")], 2) == ["a", "b"]
+    said = console.file.getvalue()
+    assert "a  cells" in said and "; b  cells" in said and "left" in said
+
+
+def test_a_training_says_its_step_while_that_lasts(often):
+    console = Console(file=io.StringIO(), width=200)
+    progress = TrainingProgress(console, "training")
+    trainer = SimpleNamespace(global_step=1, max_steps=5, callback_metrics={"val/rms_percent": 2.0})
+    progress.on_train_start(trainer, None)
+    progress.shown -= 1
+    progress.on_train_batch_end(trainer, None, {"loss": 0.5}, None, 0)
+    end = time.monotonic() + 20
+    while console.file.getvalue().count("2/5") < 3 and time.monotonic() < end:
+        time.sleep(0.02)
+    progress.on_train_end(trainer, None)
+    assert not stages.showing()
+    lines = [line for line in console.file.getvalue().splitlines() if "2/5" in line]
+    assert len(lines) >= 3 and "loss 5.00e-01  error 2.000 %" in lines[-1]

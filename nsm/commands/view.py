@@ -7,7 +7,6 @@ from pathlib import Path
 
 from nsm.arguments import Arguments
 from nsm.commands import add_address, add_trust
-from nsm.errors import NsmError
 from nsm.optional_dependencies import needed
 
 
@@ -21,8 +20,8 @@ def main(arguments: list[str]) -> None:
     parser = Arguments(
         prog="nsm view",
         description="Show the result of a run in the browser: a mesh beside its neural surface or "
-        "its flattening, or the two surfaces of a map (of a collection, any pair). A click on one "
-        "shape marks the point and its image on the other.",
+        "its flattening (of several charts, their atlas), or the two surfaces of a map (of a "
+        "collection, any pair). A click on one shape marks the point and its image on the other.",
         epilog="There is no password: anyone who can reach the port can see the shapes. To view "
         "from another machine, forward the port with ssh -L 8080:localhost:8080 MACHINE.",
     )
@@ -33,16 +32,9 @@ def main(arguments: list[str]) -> None:
     needed("viser", "nsm view", "view")
     # torch takes seconds to import, which --help and wrong options do not need
     from nsm.api import load
-    from nsm.results.parameterization_atlas import ParameterizationAtlas
     from nsm.results.view import serving
 
     result = load(given.folder, trust=given.trust)
-    if isinstance(result, ParameterizationAtlas):
-        raise NsmError(
-            f"{given.folder}: an atlas of charts; view one of them, as {given.folder / 'part_0'}",
-            kind="wrong_type",
-            key=str(given.folder),
-        )
     with serving(result, given.host, given.port) as (_, address):
         print(f"{given.folder}: {address} (Ctrl-C ends)", flush=True)
         while True:

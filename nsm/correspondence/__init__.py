@@ -1,13 +1,14 @@
 """Correspondences without landmarks: proposals, their scores, and how sure they are; and whether
 landmarks that are given fit each other."""
 
-from nsm.correspondence.agreement import Agreement, agreement
+from nsm.correspondence.agreement import Agreement, CommonAgreement, agreement
 from nsm.correspondence.collection_proposal import CollectionProposal, proposed_for_all
 from nsm.correspondence.proposal import Hypothesis, Proposal, proposed
 
 __all__ = [
     "Agreement",
     "CollectionProposal",
+    "CommonAgreement",
     "Hypothesis",
     "Proposal",
     "agreement",

@@ -1,7 +1,8 @@
-"""Whether landmarks of two surfaces fit each other, from distances alone: before any training."""
+"""Whether landmarks of surfaces fit each other, from distances alone: before any training."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -44,38 +45,88 @@ class Agreement:
         return bool(one.any()) or (self.correlation < _RELATED_ALL and apart)
 
 
+@dataclass(frozen=True)
+class CommonAgreement:
+    """How the landmarks of several surfaces fit each other.
+
+    Attributes:
+        pairs: the agreement of surfaces i < j, where they have landmarks enough in common.
+    """
+
+    pairs: dict[tuple[int, int], Agreement]
+
+    def of(self, surface: int) -> list[Agreement]:
+        """The agreements of a surface with the others."""
+        return [found for ends, found in self.pairs.items() if surface in ends]
+
+    def correlation(self, surface: int) -> float:
+        """Mean over the others of the correlation of distances."""
+        return float(np.mean([found.correlation for found in self.of(surface)]))
+
+    @property
+    def worst(self) -> tuple[int, int]:
+        """The surface that fits the others least, and the number of its worst landmark."""
+        surfaces = sorted({k for ends in self.pairs for k in ends})
+        doubts = {k: np.mean([found.doubtful for found in self.of(k)]) for k in surfaces}
+        surface = min(surfaces, key=lambda k: (-doubts[k], self.correlation(k)))
+        each = np.stack([found.each for found in self.of(surface)])
+        known = np.isfinite(each).any(axis=0)
+        mean = np.full(each.shape[1], np.inf)
+        mean[known] = np.nanmean(each[:, known], axis=0)
+        return surface, int(mean.argmin())
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether a surface disagrees with most of the others: one pair alone may be unlike."""
+        own = self.of(self.worst[0])
+        return sum(found.doubtful for found in own) > len(own) / 2
+
+
 def agreement(
     meshes: Sequence[tuple[np.ndarray, np.ndarray]], landmarks: Sequence[np.ndarray]
-) -> Agreement | None:
-    """Compare the distances, along edges, between landmarks on two meshes.
+) -> CommonAgreement | None:
+    """Compare the distances, along edges, between landmarks on meshes.
 
     Args:
-        meshes: vertices (V, 3) and faces (F, 3) of both.
+        meshes: vertices (V, 3) and faces (F, 3) of two or more.
         landmarks: vertices (L,) of each; negative ones are missing.
 
     Returns:
-        None for fewer than five landmarks that both have.
+        None if no two meshes have five landmarks in common.
     """
-    there = np.stack(landmarks) >= 0
-    both = np.flatnonzero(there.all(axis=0))
-    if len(both) < FEWEST:
-        return None
-    first, second = (
-        edge_distances(*mesh, ids[both])[:, ids[both]]
-        for mesh, ids in zip(meshes, landmarks, strict=True)
-    )
+    apart = [_distances(*mesh, ids) for mesh, ids in zip(meshes, landmarks, strict=True)]
+    pairs = {}
+    for i, j in itertools.combinations(range(len(meshes)), 2):
+        found = _compared(apart[i], apart[j])
+        if found is not None:
+            pairs[i, j] = found
+    return CommonAgreement(pairs) if pairs else None
+
+
+def _distances(vertices: np.ndarray, faces: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """Between landmarks (L,), (L, L); nan for those that are missing."""
+    apart = np.full((len(ids), len(ids)), np.nan)
+    there = np.flatnonzero(ids >= 0)
+    if len(there):
+        apart[np.ix_(there, there)] = edge_distances(vertices, faces, ids[there])[:, ids[there]]
+    return apart
+
+
+def _compared(first: np.ndarray, second: np.ndarray) -> Agreement | None:
+    """The agreement of distances (L, L); None for fewer than five landmarks that both have."""
+    both = ~np.isnan(np.diagonal(first) + np.diagonal(second))
     known = np.isfinite(first) & np.isfinite(second) & (first > 0) & (second > 0)
-    if not known.any():
+    if both.sum() < FEWEST or not known.any():
         return None
     ratio = np.full(first.shape, np.nan)
     ratio[known] = np.log(second[known] / first[known])
     ratio -= np.nanmedian(ratio)
-    each, spread = np.full(there.shape[1], np.nan), np.full(there.shape[1], np.nan)
-    for row, k in enumerate(both):
-        others = known[row]
+    each, spread = np.full((2, len(first)), np.nan)
+    for k in np.flatnonzero(both).tolist():
+        others = known[k]
         if others.sum() >= FEWEST - 1:
-            each[k] = _correlation(first[row, others], second[row, others])
-            spread[k] = np.median(np.abs(ratio[row, others]))
+            each[k] = _correlation(first[k, others], second[k, others])
+            spread[k] = np.median(np.abs(ratio[k, others]))
     if np.isnan(each).all():
         return None
     return Agreement(_correlation(first[known], second[known]), each, spread)

@@ -6,26 +6,17 @@ import numpy as np
 
 from nsm.domains.disc import Disc
 from nsm.domains.planar_mesh import signed_areas
+from nsm.domains.slim import slim
+from nsm.stages import at
 from nsm.surfaces import topology
 
 SLIM_ITERATIONS = 200
 ARAP_ROUNDS = 30
 
 
-def slim(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray) -> np.ndarray:
+def free_slim(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray) -> np.ndarray:
     """SLIM with a free boundary (symmetric Dirichlet) from an injective start (V, 2)."""
-    import igl
-
-    data = igl.slim_precompute(
-        np.asfortranarray(vertices),
-        np.asfortranarray(faces, dtype=np.int32),
-        np.asfortranarray(start),
-        igl.SYMMETRIC_DIRICHLET,
-        np.zeros(0, dtype=np.int32),
-        np.asfortranarray(np.zeros((0, 2))),
-        0.0,
-    )
-    return np.array(igl.slim_solve(data, SLIM_ITERATIONS))[:, :2]
+    return slim(vertices, faces, start, SLIM_ITERATIONS)
 
 
 def harmonic(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -56,12 +47,13 @@ def arap(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray) -> np.ndarr
     held = np.array([0], dtype=np.int32)
     igl.arap_precomputation(vertices, faces, 2, held, data)
     uv = np.ascontiguousarray(start)
-    for _ in range(ARAP_ROUNDS):
+    for k in range(ARAP_ROUNDS):
+        at("ARAP", k, ARAP_ROUNDS)
         uv = igl.arap_solve(np.ascontiguousarray(start[held]), data, uv)
     return uv
 
 
-BASELINES = {"SLIM": slim, "ARAP": arap, "LSCM": lscm, "harmonic": harmonic}
+BASELINES = {"SLIM": free_slim, "ARAP": arap, "LSCM": lscm, "harmonic": harmonic}
 
 
 def _equal_area(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> np.ndarray:

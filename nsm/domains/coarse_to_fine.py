@@ -14,6 +14,7 @@ import numpy as np
 
 from nsm.domains.decimation import Round, coarsen, present_faces, undo
 from nsm.domains.vertex_relaxation import Freedom, Stars, relax, sweep
+from nsm.stages import at
 from nsm.surfaces import topology
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ def embed_coarse_to_fine(
         if not _reinsert(vertices, current, uv, freedom, step):
             return None
         present = present_faces(current)
+        at("faces laid out", len(present), len(faces))
         if len(present) >= _GROWTH * swept or step is rounds[0]:
             swept = len(present)
             sweep(vertices, present, uv, freedom, _SWEEPS)

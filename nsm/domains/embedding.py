@@ -20,8 +20,10 @@ import numpy as np
 from nsm.domains.coarse_to_fine import embed_coarse_to_fine
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.sliding import slide
+from nsm.domains.slim import slim
 from nsm.domains.tutte import tutte
 from nsm.errors import NsmError
+from nsm.stages import at
 from nsm.surfaces import topology
 from nsm.surfaces.geometry import triangle_distortion
 
@@ -89,6 +91,7 @@ def embed(
         held: np.ndarray,
     ) -> np.ndarray:
         nonlocal tutte_distortion
+        at("Tutte's embedding")
         start = _tutte_start(vertices, faces, loop, boundary, name, log)
         tutte_distortion = _median_distortion(vertices, faces, start)
         if method == "tutte":
@@ -186,22 +189,9 @@ def _slim_held(
     log: list[str],
 ) -> np.ndarray:
     """libigl's SLIM with a softly fixed boundary, moved exactly to ∂Ω without flips."""
-    import igl
-
     iterations = 30 if len(faces) < 40_000 else 12
-    bc = np.zeros((len(loop), 2))
-    bc[:] = boundary
     try:
-        data = igl.slim_precompute(
-            np.asfortranarray(vertices, dtype=np.float64),
-            np.asfortranarray(faces, dtype=np.int32),
-            np.asfortranarray(start, dtype=np.float64),
-            igl.SYMMETRIC_DIRICHLET,
-            loop.astype(np.int32),
-            np.asfortranarray(bc),
-            1e5,
-        )
-        solved = np.array(igl.slim_solve(data, iterations))[:, :2]
+        solved = slim(vertices, faces, start, iterations, loop, boundary)
     except RuntimeError as error:
         log.append(f"libigl SLIM failed ({error}): sliding steps start from Tutte's embedding")
         return start

@@ -8,16 +8,18 @@ import numpy as np
 
 from nsm.domains.base import BoundedDomain, Domain
 from nsm.domains.embedding import Embedding
-from nsm.domains.planar_mesh import boundary_self_intersections, signed_areas
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles, signed_areas
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.cutting import Cut, seam_pairs, split_chords
+from nsm.surfaces.cutting import Cut, disc_seam, seam_pairs, split_chords
 from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.seams import uv_seams
 from nsm.surfaces.validation import CleanMesh
 
 _KEY = "surface.parameterization"
 _ON_BOUNDARY = 1e-5  # single precision of a file
+# how far the sides of a cut are moved apart, of the way to the middle of the triangles around
+_APART = (1e-3, 1e-5, 1e-7)
 
 
 def check_given(
@@ -74,11 +76,11 @@ def islands_as_given(
 
     Returns:
         Discs, which have the vertices of their island alone, and the coordinates (V, 2) of their
-        vertices, counter-clockwise.
+        vertices, counter-clockwise: mirrored islands are turned over, those with holes cut open.
 
     Raises:
-        NsmError: ``unusable_uv``: islands with holes, flipped triangles or overlaps, or a face
-            that the repair changed.
+        NsmError: ``unusable_uv``: islands with flipped triangles or overlaps, or a face that the
+            repair changed.
     """
     own = _at_corners(mesh, faces, uv, name)
     edges = topology.edges_of(mesh.faces)
@@ -92,13 +94,23 @@ def islands_as_given(
     islands = []
     for k in np.argsort(-np.bincount(label), kind="stable").tolist():
         used, number = topology.renumbered(cut_faces[label == k], len(old))
-        part = number[cut_faces[label == k]]
-        laid = _checked(flat[used], part, name)
-        both, part, inserted = split_chords(np.hstack([mesh.vertices[old[used]], laid]), part)
-        origin = np.concatenate([old[used], np.full(inserted, -1)])
+        part, laid, origin = number[cut_faces[label == k]], flat[used], old[used]
+        lines = [log]
+        if signed_areas(laid, part).sum() < 0:
+            laid = laid * [-1, 1]
+            lines.append(
+                "mirrored in the texture coordinates: turned over, to be seen from outside"
+            )
+        if not topology.is_disc(part):
+            laid, part, inner, holes, cuts = _opened(laid, part, name)
+            origin = origin[inner]
+            lines.append(f"{holes} holes in the texture coordinates, cut open along {cuts} edges")
+        _check(laid, part, name)
+        both, part, inserted = split_chords(np.hstack([mesh.vertices[origin], laid]), part)
+        origin = np.concatenate([origin, np.full(inserted, -1)])
         loop = topology.boundary_loops(part)[0]
         points = np.ascontiguousarray(both[:, :3])
-        cut = Cut(points, part, origin, seam_pairs(origin), loop, (log,))
+        cut = Cut(points, part, origin, seam_pairs(origin), loop, tuple(lines))
         islands.append((cut, np.ascontiguousarray(both[:, 3:])))
     return islands
 
@@ -123,24 +135,51 @@ def _at_corners(mesh: CleanMesh, faces: np.ndarray, uv: np.ndarray, name: str) -
     return np.take_along_axis(uv[order], corner[:, :, None], axis=1)
 
 
-def _checked(flat: np.ndarray, faces: np.ndarray, name: str) -> np.ndarray:
-    """The coordinates (V, 2) of an island, counter-clockwise."""
-    if not topology.is_disc(faces):
-        reason = "have holes, so that they are no disc; cut them open, or take slim"
-        raise _unusable(name, reason)
-    areas = signed_areas(flat, faces)
-    if areas.sum() < 0:  # a mirrored island
-        flat = flat * [-1, 1]
-        areas = -areas
-    flipped = int((~(areas > 0)).sum())
+def _check(flat: np.ndarray, faces: np.ndarray, name: str) -> None:
+    """NsmError for coordinates (V, 2) of a disc that are not injective and counter-clockwise."""
+    flipped = flipped_triangles(flat, faces)
     if flipped:
-        reason = f"flip {flipped} of {len(areas)} triangles; mend them, or take slim"
+        reason = f"flip {flipped} of {len(faces)} triangles; mend them, or take slim"
         raise _unusable(name, reason)
     crossings = boundary_self_intersections(flat, topology.boundary_loops(faces)[0])
     if crossings:
         reason = f"overlap: their border crosses itself {crossings} times; take slim"
         raise _unusable(name, reason)
-    return flat
+
+
+def _opened(
+    flat: np.ndarray, faces: np.ndarray, name: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
+    """An island with holes, cut to a disc along short paths between its borders.
+
+    The two sides of a cut are moved apart by a hair, so that the border does not touch itself.
+
+    Args:
+        flat: (V, 2) its coordinates, counter-clockwise.
+        faces: (F, 3).
+        name: of the mesh, in messages.
+
+    Returns:
+        Coordinates (W, 2) and faces (F, 3) of the disc; which vertex (W,) each is a copy of; the
+        number of holes, and of edges cut.
+    """
+    seam, _ = disc_seam(np.pad(flat, ((0, 0), (0, 1))), faces, name=name)
+    is_cut = np.zeros(len(topology.edges_of(faces).pairs), dtype=bool)
+    is_cut[seam] = True
+    disc, origin = topology.cut_along(faces, is_cut)
+    if not topology.is_disc(disc):
+        raise _unusable(name, "are no piece of the plane, but go around a handle; take slim")
+    laid = flat[origin]
+    middle = np.zeros_like(laid)
+    np.add.at(middle, disc.ravel(), np.repeat(laid[disc].mean(axis=1), 3, axis=0))
+    middle /= np.bincount(disc.ravel(), minlength=len(laid))[:, None]
+    sides = np.unique(seam_pairs(origin))
+    for share in _APART:
+        moved = laid.copy()
+        moved[sides] += share * (middle - laid)[sides]
+        if flipped_triangles(moved, disc) <= flipped_triangles(laid, disc):
+            break
+    return moved, disc, origin, len(topology.boundary_loops(faces)) - 1, len(seam)
 
 
 def in_units_of(domain: BoundedDomain, uv: np.ndarray, faces: np.ndarray) -> np.ndarray:

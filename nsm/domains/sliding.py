@@ -14,6 +14,7 @@ from scipy.sparse import coo_matrix, diags
 
 from nsm.domains.planar_mesh import cross, flipped_triangles, symmetric_dirichlet
 from nsm.domains.tutte import factorise
+from nsm.stages import at
 
 if TYPE_CHECKING:
     from nsm.domains.base import BoundedDomain
@@ -37,7 +38,8 @@ def slide(
     inner = np.setdiff1d(np.arange(len(uv)), loop)
     problem = _Problem(faces, *_gradients(vertices, faces), inner, loop[~held[loop]], domain)
     energy = problem.energy(uv)
-    for _ in range(steps):
+    for k in range(steps):
+        at("sliding along the boundary", k, steps)
         direction = problem.proxy_step(uv)
         if direction is None:
             break

@@ -16,6 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.planar_mesh import cross, flipped, signed_areas
+from nsm.stages import counted
 from nsm.surfaces import topology
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
@@ -90,7 +91,8 @@ def untangled(
         for _ in range(rings - 1):
             near[joined[near[joined].any(axis=1)]] = True
         free = near & ~held
-        for patch in _patches(joined, free, bad):
+        patches = _patches(joined, free, bad)
+        for patch in counted(f"{int(bad.sum())} flips, {rings} rings around each", patches):
             _solve(rest, faces[patch], image, free, copies)
         if near[joined].all():
             break

@@ -12,6 +12,7 @@ from nsm.pipeline.task import Task
 from nsm.pipeline.training import lightning_trainer
 from nsm.results.certificate import verdict
 from nsm.results.divergence_guard import DivergenceGuard
+from nsm.results.progress import TrainingProgress
 from nsm.settings import PRECISIONS
 
 _SHARE = 10  # a further training has this part of the training's steps
@@ -78,6 +79,10 @@ def _train_on(task: Task, module: Any, data: pl.LightningDataModule) -> None:
     steps = max(1, config.trainer.max_steps // _SHARE)
     module.strengthen(steps)
     guard = DivergenceGuard(task.console)
-    trainer = lightning_trainer(config, [guard], devices=1, max_steps=steps, limit_val_batches=0)
+    how = module.progress_figure, module.progress_form
+    progress = TrainingProgress(task.console, "stronger terms", *how)
+    trainer = lightning_trainer(
+        config, [guard, progress], devices=1, max_steps=steps, limit_val_batches=0
+    )
     with matmul_precision(PRECISIONS[config.trainer.precision]):
         trainer.fit(module, datamodule=data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from nsm.domains.orbifold.collection_alignment import alignments_to_first, disag
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.collection_inputs import collected
+from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_landmarks
 from nsm.pipeline.landmark_inputs import name_of
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
@@ -37,6 +39,8 @@ from nsm.results import (
     figures_picture,
     map_image,
     transfer_matrix_picture,
+    warning_of_distortion,
+    warning_of_missed_landmarks,
     warning_of_tears,
     write_correspondences,
 )
@@ -45,6 +49,7 @@ from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, export_ply, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
+from nsm.stages import at, counted, stage
 from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import (
@@ -74,6 +79,7 @@ class CollectionMapTask(Task):
     has_template = False  # the first surface is one
     template_mesh: Mesh | None = None  # of its file
     proposed: ProposedLandmarks | None = None
+    check: LandmarkCheck | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         surfaces = self.settings["surfaces"] if given.surfaces is None else given.surfaces
@@ -88,10 +94,11 @@ class CollectionMapTask(Task):
         if given.surfaces is None:  # those that match a pattern now
             self.config.surfaces = surfaces if template is None else surfaces[1:]
         self.keep_absolute("surfaces", "template", "landmarks")
-        shapes = [
-            read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
-            for k, surface in enumerate(surfaces)
-        ]
+        with stage(self.console, f"{self.name}: reading"):
+            shapes = [
+                read_shape(surface, self.domain, f"surfaces[{k}]", self.config.trust)
+                for k, surface in enumerate(surfaces)
+            ]
         landmarks = self.settings["landmarks"] if given.landmarks is None else given.landmarks
         if landmarks is None:
             landmarks = files_beside(surfaces, [name_of(shape) for shape in shapes])
@@ -108,7 +115,9 @@ class CollectionMapTask(Task):
             self.console,
             template=self.has_template,
         )
-        self.use(neural_surfaces(self.config, shapes, ids, self.console), ids)
+        self.check = check_landmarks(shapes, ids, self.console)
+        draw = partial(draw_landmarks, self.folder, landmarks=ids)
+        self.use(neural_surfaces(self.config, shapes, ids, self.console, draw), ids)
 
     def use(self, phis: Sequence[NeuralSurface], ids: Sequence[np.ndarray]) -> None:
         """Take the surfaces, and the landmarks as vertices (L,) of their mesh files."""
@@ -141,8 +150,10 @@ class CollectionMapTask(Task):
         surfaces = [phi.surface for phi in self.phis]
         if not self.domain.has_boundary:
             common = self.ids if targets.shape[1] else None
-            to_first = alignments_to_first(surfaces, common)
-            for pair in disagreements(surfaces, to_first, common):
+            with stage(self.console, f"{self.title}: isotopy classes"):
+                to_first = alignments_to_first(surfaces, common)
+                unlike = disagreements(surfaces, to_first, common)
+            for pair in unlike:
                 ends = f"{surfaces[pair.source].name} → {surfaces[pair.target].name}"
                 self.console.print(
                     f"{ends}: the isotopy class that follows from the other pairs scores "
@@ -233,6 +244,7 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
+        result.metrics.update({} if self.check is None else self.check.figures)
         for (i, j), name in result.pair_names.items():
             figures = result.metrics["pairs"][name]
             source, target = self.phis[i].surface, self.phis[j].surface
@@ -246,8 +258,14 @@ class CollectionMapTask(Task):
             figures |= start_figures(source, target, first, places, end)
 
     def warnings(self, result: SurfaceCollection) -> list[Text]:
-        every = (warning_of_tears(name, of) for name, of in result.metrics["pairs"].items())
-        return [torn for torn in every if torn is not None]
+        pairs = result.metrics["pairs"]
+        found = (
+            None if self.check is None else self.check.warning,
+            warning_of_distortion(pairs),
+            warning_of_missed_landmarks(pairs),
+            *(warning_of_tears(name, of) for name, of in pairs.items()),
+        )
+        return [warning for warning in found if warning is not None]
 
     def figures(self, result: SurfaceCollection) -> dict[str, Any]:
         said = {"surfaces": result.names, "landmarks": len(self.ids[0])}
@@ -272,13 +290,17 @@ class CollectionMapTask(Task):
             (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
-        figures_picture(folder / "figures.png", result)
-        transfer_matrix_picture(folder / "transfer.png", result)
-        cycle_picture(folder / "cycle.png", result)
+        for name, draw in (
+            ("figures.png", figures_picture),
+            ("transfer.png", transfer_matrix_picture),
+            ("cycle.png", cycle_picture),
+        ):
+            at(name)
+            draw(folder / name, result)
         names = [re.sub(r"[/\\]", "_", name) for name in result.names]
-        for i, j in itertools.permutations(range(len(result)), 2):
-            if self.has_template and 0 not in (i, j):
-                continue
+        pairs = list(itertools.permutations(range(len(result)), 2))
+        kept = [ends for ends in pairs if 0 in ends or not self.has_template]
+        for i, j in counted("pairs written", kept):
             f = result.pair(i, j)
             self._write_pair(folder / f"{names[i]}_to_{names[j]}", f)
             if self.has_template and i == 0:

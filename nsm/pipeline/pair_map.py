@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated
 from nsm.pipeline.attributes import read_attributes, write_transferred
 from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.landmark_check import warn_of_landmarks
+from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_landmarks
 from nsm.pipeline.parts import closed_parts
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
@@ -43,17 +44,19 @@ from nsm.results import (
     pair_table,
     reliability_picture,
     transfer_picture,
+    warning_of_distortion,
+    warning_of_missed_landmarks,
     warning_of_tears,
     write_correspondences,
     write_reliability,
 )
 from nsm.results.file_faces import faces_of_file
-from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.results.pair_pictures import normals_picture
+from nsm.stages import at, stage
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
@@ -84,6 +87,7 @@ class PairMapTask(Task):
     attributes: dict[str, np.ndarray]
     textures: Textures | None = None
     proposed: ProposedLandmarks | None = None
+    check: LandmarkCheck | None = None
 
     def inputs(self, given: Given) -> list[Any]:
         ends = (("source", given.source), ("target", given.target))
@@ -93,22 +97,24 @@ class PairMapTask(Task):
         self.keep_absolute("source", "target", "landmarks", "attributes", "texture")
         settings = self.settings
         ends = self.inputs(given)
-        shapes = [
-            read_shape(end, self.domain, key, self.config.trust)
-            for key, end in zip(("source", "target"), ends, strict=True)
-        ]
-        self.textures = read_textures(settings["texture"], ends, shapes)
+        with stage(self.console, f"{self.name}: reading"):
+            shapes = [
+                read_shape(end, self.domain, key, self.config.trust)
+                for key, end in zip(("source", "target"), ends, strict=True)
+            ]
+            self.textures = read_textures(settings["texture"], ends, shapes)
         landmarks = settings["landmarks"] if given.landmarks is None else given.landmarks
         of_files = self.textures is not None or any(settings["attributes"].values())
         counts = [vertex_count(shape) for shape in shapes]
         shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
-        warn_of_landmarks(shapes, ids, self.console)
+        self.check = check_landmarks(shapes, ids, self.console)
         self.attributes = read_attributes(settings["attributes"], counts)
         repairs = configured_repairs(self.config)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
-        phi, psi = neural_surfaces(self.config, shapes, ids, self.console)
+        draw = partial(draw_landmarks, self.folder, landmarks=ids)
+        phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw)
         self.use(phi, psi, ids)
 
     def use(self, phi: NeuralSurface, psi: NeuralSurface, ids: Sequence[np.ndarray]) -> None:
@@ -121,7 +127,8 @@ class PairMapTask(Task):
         self.matched = matched_landmarks([phi.surface, psi.surface], ids)
         if not self.domain.has_boundary:
             common = (ids[0], ids[1]) if len(ids[0]) else None
-            self.alignments = alignments(phi.surface.part, psi.surface, common)
+            with stage(self.console, f"{self.title}: isotopy classes"):
+                self.alignments = alignments(phi.surface.part, psi.surface, common)
             scores = ", ".join(f"{one.score:.3f}" for one in self.alignments[:_CLASSES_SHOWN])
             self.console.print(f"likely isotopy classes, best first: scores {scores}")
 
@@ -241,6 +248,7 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
+        result.metrics.update({} if self.check is None else self.check.figures)
         if self.trained is not None:
             before = flipped_percent(self.trained.image_uv[source.of_part], source.part.faces)
             result.metrics["flipped_before_repair_percent"] = before
@@ -251,8 +259,13 @@ class PairMapTask(Task):
 
     def warnings(self, result: SurfaceMap) -> list[Text]:
         name = f"{self.surface.name} → {self.psi.surface.name}"
-        torn = warning_of_tears(name, result.metrics)
-        return [] if torn is None else [torn]
+        found = (
+            None if self.check is None else self.check.warning,
+            warning_of_distortion({name: result.metrics}),
+            warning_of_missed_landmarks({name: result.metrics}),
+            warning_of_tears(name, result.metrics),
+        )
+        return [warning for warning in found if warning is not None]
 
     def figures(self, result: SurfaceMap) -> dict[str, Any]:
         said: dict[str, Any] = {
@@ -294,11 +307,7 @@ class PairMapTask(Task):
         write_transferred(self.attributes, self.settings["attributes"], folder, result)
         if self.textures is not None:
             for line in write_textured(self.textures, folder, result, self.config.texture_size):
-                self.console.print(line)
-
-    def write_inputs(self, folder: Path) -> None:
-        if len(self.ids[0]):
-            landmarks_picture(folder / "landmarks.png", [self.surface, self.psi.surface], self.ids)
+                self.console.print(line, soft_wrap=True)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
         f, s, t = result, self.surface, self.psi.surface
@@ -309,16 +318,21 @@ class PairMapTask(Task):
             "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
         }
         for name, mesh in meshes.items():
+            at(name)
             for ending in (".obj", ".glb"):
                 export_surface(folder / f"{name}{ending}", *mesh)
         write_correspondences(folder / "correspondences.npz", f)
+        at("reliability")
         write_reliability(folder / "reliability.ply", f)
         reliability_picture(folder / "reliability.png", f)
-        _write_morph(folder, f, self.console)
+        at("transfer.png")
         transfer_picture(folder / "transfer.png", f)
+        at("distortion.png")
         distortion_picture(folder / "distortion.png", f)
         if isinstance(f.target.map, AnalyticSurface):
             normals_picture(folder / "normals.png", f)
+        at("morph")
+        _write_morph(folder, f, self.console)
         morph_pictures(folder / "morph.png", folder / "morph.gif", f)
 
 

@@ -32,6 +32,7 @@ from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
+from nsm.stages import at
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import Param
 from nsm.tasks.least_squares import fitted_to_layout
@@ -116,6 +117,7 @@ class ParamTask(Task):
         surface = self.surface
         maps = {**self._before, "nsm": result.uv}
         for name, method in BASELINES.items():
+            at(name)
             try:
                 maps[f"{name} (libigl)"] = method(surface.vertices, surface.faces, surface.uv)
             except RuntimeError as error:

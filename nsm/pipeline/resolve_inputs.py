@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,9 +152,20 @@ def _check_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarray
 
 
 def neural_surfaces(
-    config: DictConfig, shapes: Sequence[Shape], landmarks: Sequence[np.ndarray], console: Console
+    config: DictConfig,
+    shapes: Sequence[Shape],
+    landmarks: Sequence[np.ndarray],
+    console: Console,
+    shown: Callable[[list[Surface]], None] = lambda _: None,
 ) -> list[NeuralSurface]:
     """Neural surfaces of the shapes; those that are meshes are prepared jointly, and overfitted.
+
+    Args:
+        config: of the map.
+        shapes: two or more.
+        landmarks: vertices (L,) of each.
+        console: where to print.
+        shown: is given all surfaces, checked and laid out, before any network is trained.
 
     Raises:
         NsmError: a mesh that cannot be prepared.
@@ -181,5 +192,9 @@ def neural_surfaces(
             _check_landmarks(prepared, landmarks)
         for surface in prepared:
             report_surface(console, surface)
+        laid_out = dict(zip(meshes, prepared, strict=True))
+        shown([laid_out.get(k) or ready[k].surface for k in range(len(shapes))])
         ready.update(zip(meshes, cached_surfaces(prepared, config, console), strict=True))
+    else:
+        shown([ready[k].surface for k in range(len(shapes))])
     return [ready[k] for k in range(len(shapes))]

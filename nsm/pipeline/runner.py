@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from rich.text import Text
 
 from nsm.errors import NsmError
 from nsm.instantiation import made
@@ -79,7 +80,9 @@ def run_task(
         task = make_task(config, console)
         check_device(config)
         check_packages(config.logger)
-        task.choose_domain(given or Given())
+        task.folder = folder if config.artefacts else None
+        with stage(console, f"{task.name}: reading"):
+            task.choose_domain(given or Given())
         task.prepare(given or Given())
         run = Run(config, folder, resuming)
         parts = task.parts()
@@ -113,9 +116,6 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
     """
     with stage(task.console, f"{task.title}: network and samples"):
         module, data = built(task), task.build_data()
-        if task.config.artefacts:
-            run.folder.mkdir(parents=True, exist_ok=True)
-            task.write_inputs(run.folder)
     trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
     while task.begin_again(module):
         # first this, then the new settings: a run that is killed between does the same again
@@ -144,7 +144,8 @@ def run_parts(task: Task, parts: list[Task], run: Run, started: float) -> Any:
     result = task.joined(results)
     task.measure(result)
     task.save(run.folder, result)
-    _print_figures(task, run, result, time.monotonic() - started)
+    warnings = task.warnings(result)
+    _print_figures(task, run, result, warnings, time.monotonic() - started)
     if task.config.artefacts:
         task.write_artefacts(run.folder, result)
     summary = {
@@ -152,6 +153,7 @@ def run_parts(task: Task, parts: list[Task], run: Run, started: float) -> Any:
         "steps": steps,
         "seconds": round(time.monotonic() - started, 2),
         **task.figures(result),
+        "warnings": [warning.plain for warning in warnings],
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
@@ -220,7 +222,8 @@ def finish(
     with stage(task.console, f"{task.title}: figures"):
         task.measure(result)
         task.save(run.folder, result)
-    _print_figures(task, run, result, time.monotonic() - started)
+    warnings = task.warnings(result)
+    _print_figures(task, run, result, warnings, time.monotonic() - started)
     if task.config.artefacts:
         with stage(task.console, f"{task.title}: pictures and meshes"):
             task.write_artefacts(run.folder, result)
@@ -237,6 +240,7 @@ def finish(
         "faults": guard_of(trainer),
         **task.figures(result),
         **figures,
+        "warnings": [warning.plain for warning in warnings],
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
@@ -245,7 +249,9 @@ def finish(
     return result
 
 
-def _print_figures(task: Task, run: Run, result: Any, seconds: float) -> None:
+def _print_figures(
+    task: Task, run: Run, result: Any, warnings: Sequence[Text], seconds: float
+) -> None:
     """A table and warnings; of a neural surface that a map needs, one line."""
     if run.inner:
         line = task.inner_line(result)
@@ -258,7 +264,7 @@ def _print_figures(task: Task, run: Run, result: Any, seconds: float) -> None:
         return
     if task.table is not None:
         task.console.print(task.table(result.metrics))
-    for warning in task.warnings(result):
+    for warning in warnings:
         task.console.print(warning, soft_wrap=True)
 
 

@@ -75,6 +75,8 @@ class Task:
         config: of the run.
         domain: Ω.
         console: where to print.
+        folder: where ``prepare`` may leave pictures of its inputs, once they are known to be good;
+            None: nowhere.
         surface: the surface whose name and preparation metrics.json reports.
         trained: if the task is certified, the result as it was trained, before any repair; None
             before that.
@@ -93,6 +95,7 @@ class Task:
     domain: Any  # nsm.domains.Domain; maps need more of it than a domain without boundary has
     console: Console
     surface: Surface
+    folder: Path | None = None
     trained: Any = None
 
     def __init__(self, name: str = "task") -> None:
@@ -253,9 +256,6 @@ class Task:
     def save(self, folder: Path, result: Any) -> None:
         """Write the result into the run folder."""
         result.save(folder)
-
-    def write_inputs(self, folder: Path) -> None:
-        """Write pictures of the inputs into the run folder, before the training."""
 
     def write_artefacts(self, folder: Path, result: Any) -> None:
         """Write pictures and exported meshes into the run folder."""

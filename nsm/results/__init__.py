@@ -34,6 +34,8 @@ from nsm.results.tables import (
     comparison_table,
     metrics_table,
     pair_table,
+    warning_of_distortion,
+    warning_of_missed_landmarks,
     warning_of_tears,
 )
 from nsm.results.textured_mesh import TexturedMesh
@@ -66,6 +68,8 @@ __all__ = [
     "pair_metrics",
     "pair_table",
     "transfer_picture",
+    "warning_of_distortion",
+    "warning_of_missed_landmarks",
     "warning_of_tears",
     "NeuralSurface",
     "Parameterization",

@@ -183,8 +183,8 @@ class Pictures(Callback):
         self._take(trainer, pl_module, trainer.global_step / trainer.max_steps, "gradients")
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        share = trainer.global_step / max(1, trainer.max_steps)
-        self._take(trainer, pl_module, min(share, 0.999))  # the last are those of the end
+        if trainer.global_step < trainer.max_steps:  # the last are those of the end
+            self._take(trainer, pl_module, trainer.global_step / trainer.max_steps)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         if trainer.global_step and not trainer.interrupted:

@@ -24,6 +24,7 @@ from nsm.results.metrics import evaluate
 from nsm.results.networks import placed_map
 from nsm.results.pair_metrics import pair_metrics
 from nsm.results.surface_map import SurfaceMap
+from nsm.stages import counted, part
 
 FORMAT = "nsm-collection"
 STEM = "collection"
@@ -99,11 +100,16 @@ class SurfaceCollection:
     @property
     def certificate(self) -> dict[str, Any]:
         """Whether the maps of all ordered pairs are injective (see :func:`certificate`)."""
-        return combined(self.pair(*ends).certificate for ends in self._ordered)
+        return combined(
+            self.pair(*ends).certificate for ends in counted("pairs checked", list(self._ordered))
+        )
 
     def repaired(self) -> SurfaceCollection:
         """The collection with :meth:`SurfaceMap.repaired` maps."""
-        made = {ends: self.pair(*ends).repaired() for ends in self._ordered}
+        made = {}
+        for ends in self._ordered:
+            with part(self.pair_names[ends]):
+                made[ends] = self.pair(*ends).repaired()
         corrections = {ends: f.correction for ends, f in made.items() if len(f.correction.vertices)}
         return replace(self, corrections=corrections, _made=made)
 
@@ -207,7 +213,7 @@ def collection_metrics(
         on the triangles of each surface, close approximately.
     """
     pairs = {}
-    for i, j in itertools.permutations(range(len(collection)), 2):
+    for i, j in counted("pairs measured", list(itertools.permutations(range(len(collection)), 2))):
         f = collection.pair(i, j)
         s, t = f.source.surface, f.target.surface
         both = np.isfinite(targets[i]).all(axis=1) & np.isfinite(targets[j]).all(axis=1)
@@ -218,7 +224,7 @@ def collection_metrics(
     cycles = list(itertools.permutations(range(len(collection)), 3))
     cycles = cycles[:: -(-len(cycles) // _MOST_CYCLES)]
     for name, error in (("", _cycle_error), ("_networks", _networks_cycle_error)):
-        errors = [error(collection, *cycle) for cycle in cycles]
+        errors = [error(collection, *cycle) for cycle in counted("cycles measured", cycles)]
         figures[f"cycle_error{name}_mean_percent"] = float(np.mean([e.mean() for e in errors]))
         figures[f"cycle_error{name}_max_percent"] = float(max(e.max() for e in errors))
     return figures

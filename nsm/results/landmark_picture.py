@@ -33,7 +33,7 @@ def landmarks_picture(
         middle = np.median(depth)
         for number in np.flatnonzero(ids >= 0).tolist():
             at = surface.cut_vertex[ids[number]]
-            words = {"textcoords": "offset points", "fontsize": 8}
+            words = {"textcoords": "offset points", "fontsize": 11}
             pale = 1.0 if depth[at] > middle else 0.4
             axes.annotate(str(number), pixels[at], (4, 4), **words, alpha=pale)
     save_figure(figure, path)

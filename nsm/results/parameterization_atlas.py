@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,11 @@ class ParameterizationAtlas:
     def metrics(self) -> dict[str, dict[str, float]]:
         """The figures of each chart, by its name."""
         return {chart.phi.surface.name: chart.metrics["nsm"] for chart in self.charts}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The settings of the run that made it."""
+        return self.charts[0].config
 
     @cached_property
     def _packed(self) -> tuple[list[np.ndarray], float]:

@@ -1,8 +1,9 @@
-"""A progress bar with time left, loss and current error; plain lines where there is no terminal."""
+"""A progress bar with time left, loss and current error; where there is no terminal, a stage."""
 
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from typing import Any
 
 import pytorch_lightning as pl
@@ -18,9 +19,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from nsm.stages import QUIET_FOR, QUIET_SHARE
+from nsm.stages import at, showing, stage
 
-_BAR_EVERY = 0.2  # seconds between two updates of the bar
+_EVERY = 0.2  # seconds between two updates
 
 
 class TrainingProgress(Callback):
@@ -46,13 +47,15 @@ class TrainingProgress(Callback):
         self.transient = transient
         self.bar: Progress | None = None
         self.task: TaskID | None = None
-        self.started = self.shown = 0.0
-        self.first_step = 0
+        self.shown = 0.0
+        self.figures = ""
+        self.within: ExitStack | None = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.started = self.shown = time.monotonic()
-        self.first_step = trainer.global_step
-        if not self.console.is_terminal:
+        self.shown = time.monotonic()
+        if not self.console.is_terminal or showing():
+            self.within = ExitStack()
+            self.within.enter_context(stage(self.console, self.title))
             return
         self.bar = Progress(
             TextColumn("{task.description}"),
@@ -79,24 +82,17 @@ class TrainingProgress(Callback):
         batch_idx: int,
     ) -> None:
         now = time.monotonic()
-        pause = _BAR_EVERY if self.bar else max(QUIET_FOR, QUIET_SHARE * (now - self.started))
-        if now - self.shown < pause:
-            return
-        self.shown = now
-        figures = f"loss {float(outputs['loss']):.2e}"
-        error = trainer.callback_metrics.get(self.key)
-        if error is not None:
-            figures += "  " + self.form.format(float(error))
         step = trainer.global_step
-        if self.bar is not None and self.task is not None:
-            self.bar.update(self.task, completed=step, figures=figures)
-            return
-        seconds = (now - self.started) / max(1, step - self.first_step)
-        left = seconds * (trainer.max_steps - step)
-        self.console.print(
-            f"{self.title}  step {step}/{trainer.max_steps}  left {left:.0f} s  {figures}",
-            soft_wrap=True,
-        )
+        if now - self.shown >= _EVERY:
+            self.shown = now
+            self.figures = f"loss {float(outputs['loss']):.2e}"
+            error = trainer.callback_metrics.get(self.key)
+            if error is not None:
+                self.figures += "  " + self.form.format(float(error))
+            if self.bar is not None and self.task is not None:
+                self.bar.update(self.task, completed=step, figures=self.figures)
+        if self.within is not None:
+            at("step", step, trainer.max_steps, self.figures)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         if self.bar is not None and self.task is not None:
@@ -109,6 +105,9 @@ class TrainingProgress(Callback):
         self._stop()
 
     def _stop(self) -> None:
+        if self.within is not None:
+            self.within.close()
+            self.within = None
         if self.bar is not None:
             self.bar.stop()
             self.bar = None

@@ -50,7 +50,7 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
     """
     table = _narrow("map", _MAP_COLUMNS.values())
     for name, figures in metrics.items():
-        shown = (_shown(figures, key, "")[0] for key in _MAP_COLUMNS)
+        shown = (_brief(figures, key) for key in _MAP_COLUMNS)
         table.add_row(_METHODS.get(name, name), *shown)
     table.caption = f"D_iso is {LEAST_SYMMETRIC_DIRICHLET} at best, D_conf 0, σ₁/σ₂ 1"
     return table
@@ -58,6 +58,11 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
 
 # percent of the diagonal by which a seam's sides may part before it is said
 _TORN = 1.0
+# median symmetric Dirichlet of lengths stretched by 2.4 one way and shrunk as much the other. Maps
+# of the animals, busts and a plane and bird have 7 at most, those by wrong landmarks 13 and more
+_DISTORTED = 12.0
+# percent of the diagonal by which a landmark may miss its place before it is said
+_MISSED = 5.0
 
 _PAIR_ROWS = {
     "symmetric_dirichlet_median": (
@@ -72,6 +77,7 @@ _PAIR_ROWS = {
     "outside_percent": ("vertices outside Ω", "%"),
     "landmark_error_mean_percent": ("landmark error, mean", "% of diagonal"),
     "landmark_error_max_percent": ("landmark error, largest", "% of diagonal"),
+    "landmark_correlation": ("landmarks' distances, correlation", "1 for like shapes"),
     "covered_percent": ("target covered", "% of area"),
     "seam_gap_mean_percent": ("gap across the seam, mean", "% of diagonal"),
     "seam_gap_max_percent": ("gap across the seam, largest", "% of diagonal"),
@@ -104,6 +110,53 @@ def warning_of_tears(name: str, metrics: Mapping[str, float]) -> Text | None:
     )
 
 
+def warning_of_distortion(maps: Mapping[str, Mapping[str, float]]) -> Text | None:
+    """A line in red, if half of a map's triangles are distorted more than like shapes ever ask for;
+    None if there is no such map.
+
+    Args:
+        maps: the figures of :func:`nsm.results.pair_metrics` of each, by its name.
+    """
+    key = "symmetric_dirichlet_median"
+    which, worst = _beyond(maps, key, _DISTORTED)
+    if not which:
+        return None
+    return Text(
+        f"{which}: strongly distorted, median symmetric Dirichlet {maps[worst][key]:.1f} "
+        f"({LEAST_SYMMETRIC_DIRICHLET} at best), 95th percentile "
+        f"{maps[worst]['symmetric_dirichlet_p95']:.0f}. A certificate says only that a map is "
+        "continuous and injective. Check the landmarks in landmarks.png, or give more of them",
+        style="bold red",
+    )
+
+
+def warning_of_missed_landmarks(maps: Mapping[str, Mapping[str, float]]) -> Text | None:
+    """A line in red, if a landmark goes far past its place; None if none does.
+
+    Args:
+        maps: as for :func:`warning_of_distortion`.
+    """
+    key = "landmark_error_max_percent"
+    which, worst = _beyond(maps, key, _MISSED)
+    if not which:
+        return None
+    return Text(
+        f"{which}: a landmark is missed by {maps[worst][key]:.1f} % of the diagonal "
+        f"({maps[worst]['landmark_error_mean_percent']:.1f} % in the mean): landmarks contradict "
+        "each other, or the training was too short",
+        style="bold red",
+    )
+
+
+def _beyond(maps: Mapping[str, Mapping[str, float]], key: str, most: float) -> tuple[str, str]:
+    """Which maps have a figure above ``most``, in words, and the worst of them; "" for none."""
+    far = [name for name, of in maps.items() if of.get(key, 0.0) > most]
+    if not far:
+        return "", ""
+    worst = max(far, key=lambda name: maps[name][key])
+    return worst if len(maps) == 1 else f"{len(far)} of {len(maps)} maps, {worst} most", worst
+
+
 _COLLECTION_COLUMNS = {
     "start_symmetric_dirichlet_median": "median at start",
     "symmetric_dirichlet_median": "median at end",
@@ -123,7 +176,7 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
     columns = {key: label for key, label in _COLLECTION_COLUMNS.items() if key in every}
     table = _narrow("pair", columns.values())
     for name, figures in metrics["pairs"].items():
-        shown = (_shown(figures, key, "")[0] for key in columns)
+        shown = (_brief(figures, key) for key in columns)
         table.add_row(name, *shown)
     cycle = [metrics[f"cycle_error_{key}_percent"] for key in ("mean", "max")]
     table.caption = (
@@ -133,12 +186,23 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
     return table
 
 
+_WIDEST = 5  # characters of a figure in a narrow table
+
+
+def _brief(figures: Mapping[str, float], key: str) -> str:
+    """A figure in so few characters."""
+    if key not in figures:
+        return "–"
+    value = figures[key]
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:#.4g}"
+
+
 def _narrow(first: str, headings: Iterable[str]) -> Table:
-    """A table whose headings break between words, to fit a terminal of 80 columns."""
+    """A table whose headings, and names of rows, break between words, to fit a terminal of 80
+    columns; figures do not."""
     table = Table(first, padding=(0, 1, 0, 0))
-    table.columns[0].no_wrap = True
     for heading in headings:
-        table.add_column(heading, width=max(map(len, heading.split())))
+        table.add_column(heading, width=max(_WIDEST, *map(len, heading.split())))
     return table
 
 
@@ -157,6 +221,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "cycle_error_mean_percent": ("cycle error, mean", "% of diagonal"),
     "cycle_error_max_percent": ("cycle error, largest", "% of diagonal"),
     "certified": ("certified injective", ""),
+    "landmarks_doubtful": ("landmarks doubtful", ""),
     "steps": ("steps", ""),
     "seconds": ("time", "s"),
 }

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
+from nsm.side_by_side import apart
+from nsm.stages import at
 from nsm.surfaces.loading import error_in
 
 PADDING = 6  # texels between charts, at the size for which an atlas is packed
@@ -13,6 +16,7 @@ PADDING = 6  # texels between charts, at the size for which an atlas is packed
 # grows faster than the number of a chart's faces, so those of large meshes are smaller.
 _LARGEST_CHART = 0.05
 _CHART_FACES = 2000
+_QUICK = 4000  # faces, of which xatlas holds the interpreter for less than a second
 
 
 def unwrapped(
@@ -33,8 +37,6 @@ def unwrapped(
     Raises:
         NsmError: ``not_unwrapped``: no face has an area.
     """
-    import xatlas
-
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
@@ -42,8 +44,17 @@ def unwrapped(
         raise error_in(
             name, "not_unwrapped", "it has no area; give a mesh with texture coordinates"
         )
-    atlas = xatlas.Atlas()
     centred = (vertices - vertices.mean(axis=0)) / np.sqrt(area)
+    work = partial(_generated, centred, faces, size)
+    at("texture atlas")
+    return apart(work) if len(faces) > _QUICK else work()
+
+
+def _generated(centred: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
+    """The atlas (F, 3, 2) of a mesh of area one."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
     atlas.add_mesh(centred.astype(np.float32), faces.astype(np.uint32))
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_chart_area = float(np.clip(_CHART_FACES / len(faces), 0.0, _LARGEST_CHART))

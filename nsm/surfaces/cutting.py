@@ -148,6 +148,20 @@ def cut_to_disc(
             suffice, ``not_a_disc`` for a seam that leaves no disc; the key is
             ``surface.seam_vertices``.
     """
+    seam, log = disc_seam(vertices, faces, seam_vertices=seam_vertices, avoided=avoided, name=name)
+    return cut_open(vertices, faces, seam, log, name)
+
+
+def disc_seam(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    seam_vertices: Sequence[int] | None = None,
+    avoided: Sequence[int] = (),
+    name: str = "mesh",
+) -> tuple[list[int], list[str]]:
+    """The numbers of the edges (see :func:`nsm.surfaces.topology.edges_of`) along which
+    :func:`cut_to_disc` cuts, and lines that say so; arguments and errors as there."""
     edges = topology.edges_of(faces)
     graph = _Graph(vertices, faces, edges, avoided)
     log: list[str] = []
@@ -175,7 +189,7 @@ def cut_to_disc(
         log.append(
             f"cut along {len(seam)} edges (genus {genus}, {len(graph.loops)} boundary loops)"
         )
-    return cut_open(vertices, faces, seam, log, name)
+    return seam, log
 
 
 def cut_along_paths(

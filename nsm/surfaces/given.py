@@ -36,7 +36,7 @@ def given_mesh(given: Any, name: str = "mesh") -> GivenMesh:
 
     Args:
         given: a mesh file or a name of the catalogue; an object with ``vertices`` and ``faces``, as
-            trimesh's; or a pair of arrays (V, 3) and (F, 3).
+            trimesh's, or a scene of trimesh; or a pair of arrays (V, 3) and (F, 3).
         name: of a mesh that has none.
 
     Raises:
@@ -48,9 +48,11 @@ def given_mesh(given: Any, name: str = "mesh") -> GivenMesh:
             return GivenMesh(Path(text).stem, *load_mesh(given))
         return GivenMesh(text, *catalogue_mesh(text))
     log: tuple[str, ...] = ()
+    file = _file_of(given)
+    if hasattr(given, "to_mesh"):  # a scene of trimesh, as it reads GLB files
+        given = given.to_mesh()
     if hasattr(given, "vertices") and hasattr(given, "faces"):
         vertices, faces = given.vertices, given.faces
-        file = _file_of(given)
         if file is not None:
             name, log = file.stem, _other_numbers(file, np.asarray(vertices))
     elif isinstance(given, (tuple, list)) and len(given) == 2:

@@ -27,6 +27,7 @@ from nsm.domains import Surface
 from nsm.instantiation import target_of
 from nsm.maps import LatticeSplineGrid, LinearInFeatures, NeuralMap, build_network
 from nsm.maps.encodings import Encoding, SplineGrid, value_and_jacobian_stack
+from nsm.stages import at
 from nsm.tasks.multigrid import lattice_refinements, solve, solve_through
 
 # samples for each grid point or feature
@@ -161,6 +162,7 @@ def _fit_tables(
     uv, along, left = uv[order], along[..., order], target[..., order]
     column = grid.out_dim - grid.features * len(grid.tables)  # past x itself, if it is a feature
     for level, table in enumerate(grid.tables):
+        at(f"equations of level {level + 1} of {len(grid.tables)} of the grid")
         enough = order < max(_FEWEST, _SAMPLES * len(table))
         some = (part if enough.all() else part[..., enough] for part in (uv.t(), along, left))
         found = torch.as_tensor(_best(grid, level, *some)).to(left)
@@ -191,8 +193,10 @@ def _best(grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tenso
     small."""
     if isinstance(grid, LatticeSplineGrid):
         matrix, right = _on_lattice(grid, level, uv, along, target)
+        at(f"solution of {len(right):,} equations")
         return solve_through(matrix, right, lattice_refinements(grid, level))
     matrix, right = _normal_equations(grid, level, uv, along, target)
+    at(f"solution of {len(right):,} equations")
     return solve(matrix, right, grid.resolutions[level], grid.degree)
 
 

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from nsm.domains import Surface
+from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.errors import NsmError
 from nsm.surfaces.shapes import hemisphere, ring_mesh, saddle
+from nsm.surfaces.topology import boundary_loops, is_disc
 
 
 def load(vertices, faces, uv, **options):
@@ -105,3 +107,45 @@ def test_what_does_not_go_with_them_is_refused(options, kind):
             vertices, faces, **{"uv": uv[faces], "parameterization": "given", **options}
         )
     assert refused.value.kind == kind
+
+
+def test_a_mirrored_island_is_turned_over_and_that_is_said():
+    vertices, faces, uv = bent()
+    for sign, said in ((1, False), (-1, True)):
+        surface = load(vertices, faces, uv * [sign, 1])
+        assert any("mirrored" in line for line in surface.log) == said
+
+
+def with_holes():
+    """The bent disc with two holes."""
+    vertices, faces, uv = bent(10)
+    middle = uv[faces].mean(axis=1)
+    hole = np.zeros(len(faces), dtype=bool)
+    for place in ([0.5, 0], [-0.4, -0.3]):
+        hole |= np.linalg.norm(middle - place, axis=1) < 0.2
+    return vertices, faces[~hole], uv
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_island_with_holes_is_cut_open(sign):
+    vertices, faces, uv = with_holes()
+    assert len(boundary_loops(faces)) == 3
+    surface = load(vertices, faces, uv * [sign, 1])
+    assert any("2 holes" in line for line in surface.log)
+    assert is_disc(surface.faces) and len(surface.seam_pairs) > 2
+    known = surface.source_vertex >= 0
+    own, given = surface.given_uv[known], uv[surface.source_vertex[known]]
+    given = given - given.mean(axis=0)
+    given *= np.linalg.norm(own - own.mean(axis=0)) / np.linalg.norm(given)
+    assert np.abs(own - own.mean(axis=0) - given).max() < 2e-3  # but for a hair at the cuts
+    assert flipped_triangles(surface.given_uv, surface.faces) == 0
+    loop = boundary_loops(surface.faces)[0]
+    assert boundary_self_intersections(surface.given_uv, loop) == 0
+
+
+def test_an_island_that_covers_a_hole_twice_is_refused():
+    vertices, faces, uv = with_holes()
+    z = (uv[:, 0] - 0.5 + 1j * uv[:, 1]) ** 2  # around one of the holes
+    with pytest.raises(NsmError) as refused:
+        load(vertices, faces, np.stack([z.real, z.imag], axis=1))
+    assert refused.value.kind == "unusable_uv"

@@ -13,6 +13,7 @@ from nsm.errors import NsmError
 from nsm.pipeline import Task, certification
 from nsm.results.analytic import analytic_surface
 from nsm.results.divergence_guard import DivergenceGuard
+from nsm.results.progress import TrainingProgress
 from nsm.surfaces.shapes import ring_mesh
 
 QUICK = ["experiment=quick", "data.held_out=512", "trainer.threads=1"]
@@ -127,9 +128,11 @@ def test_further_trainings_are_guarded_and_a_failure_keeps_what_there_is(monkeyp
         raise NsmError("the loss is not finite", kind="not_finite")
 
     class Module:
+        progress_figure, progress_form = "val/distortion", "{:.3f}"
+
         def strengthen(self, steps):
             assert steps >= 1
 
     monkeypatch.setattr(certification, "lightning_trainer", no_trainer)
     best, _ = certification.certified(Scripted(Found(5, mended=1)), Module(), None)
-    assert best.flips == 4 and [type(c) for c in seen] == [DivergenceGuard]
+    assert best.flips == 4 and [type(c) for c in seen] == [DivergenceGuard, TrainingProgress]

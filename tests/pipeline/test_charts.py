@@ -1,6 +1,7 @@
 """task=param along given seams: one chart, or an atlas of several."""
 
 import re
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import networkx
@@ -13,8 +14,11 @@ import nsm
 from nsm.errors import NsmError
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.textured_mesh import TexturedMesh
+from nsm.results.view import serving
+from nsm.results.view.scene import scene_of
 from nsm.surfaces import topology
 from nsm.surfaces.loading import load_mesh
+from nsm.surfaces.location import Places
 
 OWN = ("surface.path", "trainer.progress", "artefacts")
 TINY = [word for word in TRAINING if not word.startswith(OWN)]
@@ -160,3 +164,29 @@ def test_what_does_not_go_with_given_coordinates_is_refused(what, kind):
     with pytest.raises(NsmError) as refused:
         nsm.parameterize(**{"phi": "hemisphere", **what}, overrides=GIVEN, progress=False)
     assert refused.value.kind == kind
+
+
+def test_the_viewer_shows_all_charts_and_their_atlas(run):
+    folder, _ = run
+    atlas = nsm.load(folder)
+    vertices, _, _ = halves()
+    scene = scene_of(atlas)
+    source, target = scene.shapes
+    assert np.allclose(source.coordinates, vertices[source.numbers], atol=1e-5)
+    assert len(source.seam) > 10  # where the halves meet
+    face = np.arange(0, len(source.faces), 7)
+    places = Places(face, np.full((len(face), 3), 1 / 3))
+    assert np.array_equal(scene.corresponding(0, places).face, face)
+    assert np.array_equal(scene.corresponding(1, places).face, face)
+    # the flattening is nearly isometric, in one unit for all charts
+    assert np.median(scene.energies["symmetric dirichlet"]) < 6
+    assert np.ptp(target.vertices @ scene.frame[2]) < 1e-9  # it faces the viewer
+    for name in scene.colourings:
+        for paint in scene.paint(name):
+            values = paint.colours if paint.checkerboard is None else paint.checkerboard
+            assert len(values) == len(source.vertices)
+    pytest.importorskip("viser", reason="needs nsm[view]")
+    with serving(atlas, "127.0.0.1", 0) as (viewer, _):
+        ray = scene.camera[0], source.vertices[0] + scene.offsets[0] - scene.camera[0]
+        viewer.on_click(SimpleNamespace(ray_origin=ray[0], ray_direction=ray[1]))
+        assert "atlas" in viewer._list.content

@@ -151,3 +151,10 @@ def test_a_preview_is_the_fast_way_on_coarse_levels(task):
     assert preview.trainer.max_steps < fast.trainer.max_steps
     assert max(preview.data.points) < max(fast.data.points)
     assert list(preview.data.steps) == list(preview.optimizer.steps)
+
+
+@pytest.mark.parametrize("task", ["pair_map", "collection_map", "param"])
+def test_a_fast_run_has_a_validation_curve_of_several_points(task):
+    config = compose_config([f"task={task}", "experiment=fast"])
+    assert config.trainer.max_steps >= 2 * config.data.steps_per_epoch
+    assert config.trainer.log_every == 1

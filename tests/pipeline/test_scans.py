@@ -106,6 +106,7 @@ def test_the_template_lies_on_each_scan(run, folder):
     }
     said = json.loads((place / "metrics.json").read_text())
     assert said["surfaces"] == group.names and said["template"] == "template"
+    assert said["warnings"] == [] and (place / "landmarks.png").is_file()
 
 
 def test_patterns_are_sorted_and_the_template_comes_first(folder, monkeypatch):

@@ -56,3 +56,13 @@ def test_other_vertex_numbers_than_the_file_has_are_told(tmp_path):
     assert len(mesh.vertices) == len(other.vertices)
     assert bool(given_mesh(same).log) == (len(same.vertices) != 5)
     assert given_mesh(str(file)).log == ()
+
+
+def test_a_scene_as_trimesh_reads_glb_files_is_its_mesh(tmp_path):
+    file = tmp_path / "box.glb"
+    trimesh.Scene(BOX).export(file)
+    scene = trimesh.load(file)
+    mesh = given_mesh(scene)
+    own = given_mesh(file)
+    assert mesh.name == "box" and mesh.log == ()
+    assert np.allclose(mesh.vertices, own.vertices) and np.array_equal(mesh.faces, own.faces)

@@ -13,6 +13,7 @@ from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.errors import NsmError
+from nsm.stages import counted
 from nsm.surfaces import topology
 from nsm.surfaces.geometry import edge_graph
 
@@ -172,9 +173,10 @@ def _best(
 ) -> list[tuple[float, np.ndarray, list[np.ndarray]]]:
     """As :func:`compared`, of meshes with their candidates; the ``wanted`` best are sure to be
     among the results."""
-    first = [each[0].score(four) for four in sets]
+    first = [each[0].score(four) for four in counted("sets of cones tried on a mesh", sets)]
     found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
-    for k in np.argsort([score for score, _ in first], kind="stable").tolist():
+    order = np.argsort([score for score, _ in first], kind="stable").tolist()
+    for k in counted("sets of cones tried on all meshes", order):
         ways = [first[k]]
         limit = sorted(score for score, _, _ in found)[wanted - 1 : wanted]
         for mesh in each[1:]:

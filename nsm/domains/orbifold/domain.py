@@ -206,7 +206,7 @@ class ClosedDomain(Domain):
         if target not in _GRIDS or settings.get("degree", 2) != 2:
             raise NsmError(
                 f"setting encoding: domain={self} needs encoding=spline_grid of degree 2, which it "
-                "makes periodic; or take domain=disc",
+                "makes periodic; for another encoding or degree take domain=disc",
                 kind="wrong_domain",
                 key="encoding",
             )

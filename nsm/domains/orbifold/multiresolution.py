@@ -20,6 +20,7 @@ from nsm.domains.orbifold.newton import Quotient
 from nsm.domains.orbifold.sweeps import Stars, colour_classes, relax
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
 from nsm.errors import NsmError
+from nsm.stages import at
 from nsm.surfaces import topology
 
 AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lattice has 4
@@ -30,6 +31,7 @@ _TRIES = 3
 _SMALL = 1500  # faces of a mesh that may be relaxed after every round
 _WORST = 1e3  # times the mean: a triangle of so much energy is moved on its own
 _LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
+_SLOW = 4000  # faces whose layout is told of
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ def hierarchy(
     vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, effort: Effort
 ) -> Hierarchy:
     """Draw a closed mesh (V, 3), (F, 3) together; the vertices of a mask (V,) stay."""
+    if len(faces) > _SLOW:
+        at("drawing the mesh together")
     current, rounds = coarsen(vertices, faces, held, effort.coarse)
     alive = _alive(current)
     ids, local = topology.renumbered(current[alive], len(vertices))
@@ -161,6 +165,8 @@ def _undone(
         undo(current, step)
         alive = _alive(current)
         tight = _put_back(scaled(vertices, current[alive], area), current, layout, step)
+        if len(current) > _SLOW:
+            at("faces laid out", len(alive), len(current))
         last = step is rounds[0]
         if last or len(alive) >= effort.growth * done:
             done = len(alive)

@@ -28,6 +28,8 @@ _BEST = {
     "normal_variation_excess_degrees": "zero",
     "steps": "none",
     "certified": "none",
+    "landmark_correlation": "none",
+    "landmarks_doubtful": "none",
 }  # of the figures for which it is not the lowest value
 
 
@@ -117,6 +119,7 @@ def _task(
                 "label": label,
                 "settings": {key: shown(value) for key, value in run.settings.items()},
                 "figures": run.figures,
+                "warnings": run.warnings,
                 "curves": {tag: curve._asdict() for tag, curve in curves.items()},
                 "pictures": pictures,
                 "shapes": [_packed(shape, arrays) for shape in shapes],

@@ -394,6 +394,11 @@
   const count = tasks.reduce((sum, one) => sum + one.runs.length, 0);
   $("#count").textContent = `${count} run${count === 1 ? "" : "s"}` + (incomplete.length ? `, ${incomplete.length} problem${incomplete.length === 1 ? "" : "s"} (see the end of the page)` : "");
   $("#sweeps").hidden = !sweeps.length;
+  const warned = tasks.flatMap((one) => one.runs.flatMap((run) => run.warnings.map((text) => [run.label, text])));
+  $("#warnings").hidden = !warned.length;
+  for (const [name, text] of warned) {
+    $("#warnings ul").append(make("li", {}, make("b", { textContent: name + " " }), text));
+  }
   for (const sweep of sweeps) {
     $("#sweeps").append(make("figure", {}, make("figcaption", { textContent: sweep.name }), enlarged(sweep.picture, sweep.name)));
   }

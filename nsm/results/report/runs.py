@@ -30,6 +30,7 @@ class Run:
         subject: what it is of: a surface, "source → target", or the surfaces of a collection.
         settings: values by "group.key"; the class or name that a group chooses by "group".
         figures: numbers, yes or no by name; None for a number that is not finite.
+        warnings: what the run warned of at its end.
     """
 
     folder: Path
@@ -38,6 +39,7 @@ class Run:
     subject: str
     settings: dict[str, Any]
     figures: dict[str, Figure]
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,9 @@ def _read(folder: Path, name: str) -> Run:
         raise _damaged("config.yaml is missing", folder) from error
     except Exception as error:  # a damaged or foreign file raises any exception
         raise _damaged(f"config.yaml is damaged: {short(error)}", folder) from error
-    return Run(folder, name, str(task), _subject(stored), settings, figures)
+    said = stored.get("warnings")  # absent in older run folders
+    warnings = tuple(map(str, said)) if isinstance(said, list) else ()
+    return Run(folder, name, str(task), _subject(stored), settings, figures, warnings)
 
 
 def _subject(stored: Mapping[str, Any]) -> str:

@@ -17,12 +17,14 @@ from nsm.results.meshes import by_position
 from nsm.results.metrics import evaluate, vertex_error
 from nsm.results.pair_metrics import triangle_energies
 from nsm.results.parameterization import Parameterization
+from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.pictures import vertex_means
 from nsm.results.render import frames_of, vertex_normals
 from nsm.results.surface_map import SurfaceMap
 from nsm.results.textures import GREY
+from nsm.surfaces.cutting import seam_pairs
 from nsm.surfaces.location import Places, locate
-from nsm.surfaces.topology import edges_of
+from nsm.surfaces.topology import edges_of, face_areas
 
 POSITION, PLAIN = "position on the source", "plain"
 _GAP = 0.2  # between the shapes, in widths of the wider one
@@ -235,7 +237,10 @@ class Scene:
     field_of_view = float(_FIELD_OF_VIEW)
 
 
-def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y") -> Scene:
+Shown = NeuralSurface | Parameterization | ParameterizationAtlas | SurfaceMap
+
+
+def scene_of(result: Shown, up: str = "y") -> Scene:
     """A mesh beside its neural surface or its flattening, or the two surfaces of a map.
 
     Args:
@@ -243,6 +248,8 @@ def scene_of(result: NeuralSurface | Parameterization | SurfaceMap, up: str = "y
         up: the axis of the (source's) mesh file that points up, of
             :data:`nsm.results.render.UP_AXES`.
     """
+    if isinstance(result, ParameterizationAtlas):
+        return _atlas(result, up)
     mesh = result.source if isinstance(result, SurfaceMap) else result
     mesh = mesh.phi if isinstance(mesh, Parameterization) else mesh
     frame = frames_of(mesh.surface.part.vertices)[up]
@@ -282,6 +289,36 @@ def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
     return Scene(source, target, s.uv, flat, frame, checkerboards, _energies(s, uv))
 
 
+def _atlas(result: ParameterizationAtlas, up: str) -> Scene:
+    """All charts as one mesh, beside their places in the atlas, both in one unit; the domain of
+    both is the atlas, where no two charts overlap."""
+    surfaces = [chart.phi.surface for chart in result.charts]
+    first = np.cumsum([0, *(len(s.uv) for s in surfaces)])
+    faces = np.concatenate([s.faces + n for s, n in zip(surfaces, first, strict=False)])
+    points = np.concatenate(
+        [c.phi.in_original_units(c.phi.surface.vertices) for c in result.charts]
+    )
+    uv = np.concatenate(result.uv)
+    # as everywhere: the surface has the area of the disc
+    unit = np.sqrt(np.pi / face_areas(points, faces).sum())
+    vertices, flat = unit * points, unit / result.scale * uv
+    frame = frames_of(vertices)[up]
+    numbers = np.concatenate([s.source_vertex for s in surfaces])
+    pairs = seam_pairs(numbers)
+    middle = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
+    laid = (flat - middle) @ frame[:2]
+    name = surfaces[0].name.rpartition("-")[0]
+    start = vertices - _centre(vertices, frame)
+    source = Shape(name, start, faces, uv, points, pairs, numbers=numbers)
+    target = Shape(f"{name}: atlas", laid, faces, uv, uv, pairs, numbers=numbers)
+    checkerboards = {
+        "checkerboard of the plane": 2 * (flat - middle) / np.ptp(flat, axis=0).max(),
+        "checkerboard of the domain": np.concatenate([s.uv for s in surfaces]),
+    }
+    energies = _named(triangle_energies(vertices, flat, faces))
+    return Scene(source, target, uv, laid, frame, checkerboards, energies)
+
+
 def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
     unreached = f.unreached if f.unreached.any() else None
     f = f.part
@@ -315,7 +352,10 @@ def _file_shape(
 
 
 def _energies(surface: Surface, image: np.ndarray) -> dict[str, np.ndarray]:
-    energies = triangle_energies(surface.vertices, image, surface.faces)
+    return _named(triangle_energies(surface.vertices, image, surface.faces))
+
+
+def _named(energies: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name.replace("_", " "): value for name, value in energies.items()}
 
 

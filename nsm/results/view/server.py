@@ -16,17 +16,14 @@ from trimesh.creation import icosphere
 
 from nsm.errors import NsmError
 from nsm.optional_dependencies import needed
-from nsm.results.artifact import NeuralSurface
 from nsm.results.collection import SurfaceCollection
-from nsm.results.parameterization import Parameterization
 from nsm.results.render import UP_AXES, axis_of
-from nsm.results.surface_map import SurfaceMap
 from nsm.results.view.colours import distinct_colours
 from nsm.results.view.glb import as_glb
 from nsm.results.view.picking import Pick, pick
-from nsm.results.view.scene import scene_of
+from nsm.results.view.scene import Shown, scene_of
 
-Result = NeuralSurface | Parameterization | SurfaceMap | SurfaceCollection
+Result = Shown | SurfaceCollection
 
 _NODES = "/source", "/target"
 _PICKS = 5  # the latest, on both shapes; a new one replaces the oldest
@@ -56,7 +53,7 @@ class Viewer:
         self._show_scene()
         server.scene.on_click()(self.on_click)
 
-    def _current(self) -> NeuralSurface | Parameterization | SurfaceMap:
+    def _current(self) -> Shown:
         if isinstance(self.result, SurfaceCollection):
             return self.result.pair(*self._pair)
         return self.result
