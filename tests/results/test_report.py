@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 
 from nsm.commands import report
@@ -330,7 +331,8 @@ def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_
         shutil.copytree(runs / "sweep" / name, sweep / str(len(name)))
     table = write_sweep(sweep)
     names = ["hemisphere, activation=relu", "hemisphere, activation=silu"]
-    assert list(table.columns[0].cells) == names
+    # what all jobs are of stands above the table
+    assert [f"{table.title}, {cell}" for cell in table.columns[0].cells] == names
     with (sweep / "sweep.csv").open() as stream:
         rows = {row["job"]: row for row in csv.DictReader(stream)}
     assert set(rows) == set(names)
@@ -344,6 +346,25 @@ def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_
     assert shown["name"] == "sweep-activation"
     data = base64.b64decode(shown["picture"].split(",")[1])
     assert Image.open(io.BytesIO(data)).width >= 900
+
+
+def test_a_sweep_of_the_seams_weight_shows_the_gap_and_the_landmarks(runs, tmp_path):
+    gaps = {"0": 1.25, "1000": 0.125}
+    for weight, gap in gaps.items():
+        job = tmp_path / weight
+        shutil.copytree(runs / "map", job)
+        config = OmegaConf.load(job / "config.yaml")
+        config.loss_weights.seam = float(weight)
+        OmegaConf.save(config, job / "config.yaml")
+        stored = json.loads((job / "metrics.json").read_text())
+        stored["metrics"] |= {"seam_gap_mean_percent": gap, "landmark_error_max_percent": 2 * gap}
+        (job / "metrics.json").write_text(json.dumps(stored))
+    table = write_sweep(tmp_path, figure=False)
+    cells = {str(column.header): list(column.cells) for column in table.columns}
+    assert cells["job"] == ["seam=0.0", "seam=1000.0"]
+    (gap,) = (shown for name, shown in cells.items() if "seam" in name)
+    (marks,) = (shown for name, shown in cells.items() if "landmark" in name)
+    assert gap == ["1.250", "0.125"] and marks == ["2.500", "0.250"]
 
 
 def test_a_view_is_upright_for_any_axis(page):
