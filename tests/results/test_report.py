@@ -25,7 +25,7 @@ from nsm.results import load_surface
 from nsm.results.metrics import evaluate
 from nsm.results.report import write_report
 from nsm.results.report.labels import labels, over_seeds
-from nsm.results.report.runs import find_runs
+from nsm.results.report.runs import Run, find_runs
 from nsm.results.report.sweep import write_sweep
 
 TINY = [
@@ -323,6 +323,26 @@ def test_the_page_has_the_axis_of_the_runs_upwards(tmp_path):
     assert content(tmp_path / "report.html")["up"] == "-z"
     write_report([tmp_path], tmp_path / "report.html", up="x")
     assert content(tmp_path / "report.html")["up"] == "x"
+
+
+def test_jobs_are_called_by_the_settings_that_tell_them_apart():
+    def told(*jobs):
+        runs = [Run(Path("x"), str(k), "overfit", "", one, {}) for k, one in enumerate(jobs)]
+        return labels(runs)
+
+    # options, each with its parameters
+    softplus = {"activation": "softplus", "activation.beta": 10.0}
+    assert told(softplus, {"activation": "relu"}) == ["activation=softplus", "activation=relu"]
+    # parameters of one class, which are those of an option by chance
+    wide = {"map": "mlp", "map.width": 64, "map.depth": 4}
+    deep = {"map": "NeuralMap", "map.width": 64, "map.depth": 1}
+    thin = {"map": "NeuralMap", "map.width": 32, "map.depth": 1}
+    names = ["width=64, depth=4", "width=64, depth=1", "width=32, depth=1"]
+    assert told(wide, deep, thin) == names
+    # neither follows from the other
+    rates = [{"optimizer": n, "optimizer.lr": r} for n in ("Adam", "SGD") for r in (0.1, 0.2)]
+    assert told(*rates)[0] == "optimizer=Adam, lr=0.1"
+    assert len(set(told(*rates))) == 4
 
 
 def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_path):

@@ -27,7 +27,7 @@ from nsm.results.tables import FIGURES, narrow
 from nsm.results.textures import GREY
 
 FIGURE, TABLE = "sweep.png", "sweep.csv"
-_ROWS, _LINES = 16, 40  # at most, in the figure and in what is printed
+_ROWS, _LINES = 24, 40  # at most, in the figure and in what is printed
 _SIDE = 420
 # of the table that is printed; the file has all figures
 _PRINTED = {
