@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from rich.table import Column, Table
 
+from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
 from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
 from nsm.results.collection import load_collection
 from nsm.results.files import atomic_write
 from nsm.results.metrics import evaluate
-from nsm.results.pair_pictures import distorted
+from nsm.results.pair_pictures import WORST, distorted
 from nsm.results.parameterization import load_parameterization
 from nsm.results.pictures import checked, fine, layout_image, panels, save_figure
 from nsm.results.render import Blend, View, vertex_normals
@@ -196,7 +197,8 @@ def _pair(f: SurfaceMap) -> _Panels:
 
 def _scale(metrics: Mapping[str, float]) -> str:
     """What the colours of the distortion say, and its median."""
-    return f"symmetric Dirichlet, 4 to 20: median {metrics['symmetric_dirichlet_median']:.3f}"
+    ends = f"{LEAST_SYMMETRIC_DIRICHLET} to {WORST:.0f}"
+    return f"symmetric Dirichlet, {ends}: median {metrics['symmetric_dirichlet_median']:.3f}"
 
 
 _DRAW: dict[str, Callable[[Path, Sequence[str]], _Panels]] = {
