@@ -56,7 +56,7 @@ COLUMNS = {
     "symmetric_dirichlet_median": "median",
     "symmetric_dirichlet_mean": "mean",
     "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_percent": "flipped %",
+    "flipped_percent": "flipped %, nothing repaired",
     "outside_percent": "outside %",
     "landmark_error_mean_percent": "landmark error, mean",
     "landmark_error_max_percent": "largest",
