@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-published bench-closed bench-correspondence bench-partial bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-flattening bench-published bench-baselines bench-closed bench-correspondence bench-partial bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -30,16 +30,27 @@ bench: .venv/.nsm-dev
 bench-steps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/steps.py $(if $(MESHES),--meshes $(MESHES))
 
-# Maps between the meshes in MESHES, and flattening compared with libigl: over an hour.
+# Maps between the meshes in MESHES, settings one by one, and flattening compared with libigl: over
+# an hour.
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
 	$(BIN)/python benchmarks/closed_maps.py $(if $(MESHES),--meshes $(MESHES))
 
+# Flattening by the isometric and the conformal energy, with a picture: two minutes. MESHES as above.
+bench-flattening: .venv/.nsm-dev
+	$(BIN)/python benchmarks/maps.py --only 'energy: flattening' $(if $(MESHES),--meshes $(MESHES))
+
 # Whole trainings by the published recipe beside the default: a quarter of an hour in the reduced
-# form, FORM=full on a GPU. MESHES as above.
+# form, FORM=full on a GPU. MESHES as above. Then one setting of its map changed at a time: a further
+# quarter of an hour.
 FORM ?= reduced
 bench-published: .venv/.nsm-dev
 	$(BIN)/python benchmarks/published.py --form $(FORM) --meshes $(MESHES)
+	$(if $(filter reduced,$(FORM)),$(BIN)/python benchmarks/published_changes.py --meshes $(MESHES))
+
+# A pair of animals by every means, with a picture: three minutes. MESHES as above.
+bench-baselines: .venv/.nsm-dev
+	$(BIN)/python benchmarks/baselines.py $(if $(MESHES),--meshes $(MESHES))
 
 # Closed surfaces on the disc and on the orbifold, default settings: ten minutes. MESHES as above.
 bench-closed: .venv/.nsm-dev

@@ -1,17 +1,17 @@
-"""Maps between classic meshes: quality and time, one JSON file for each case.
+"""Maps on the disc, settings and seams one by one, and flattenings: one JSON file for each case.
 
-Existing files are kept, so that an interrupted run continues where it stopped:
+Existing files are kept, so that an interrupted run continues where it stopped; cases that --only
+names are measured again:
 
     python benchmarks/maps.py --meshes FOLDER [--only CASE ...]
 
 Seconds are the CPU time of a map on one thread, from trained surfaces, with its figures and
-certificate.
+certificate. closed_maps.py maps many pairs, and a collection, on the disc and without a seam.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import platform
 import time
@@ -30,7 +30,7 @@ ANIMALS = ("shrec07-381", "shrec07-384", "shrec07-388", "shrec07-393")
 PICTURES = Path(__file__).parent.parent / "docs" / "pictures"
 # the two energies of the paper
 ENERGIES = {"isometric": "symmetric_dirichlet", "conformal": "conformal"}
-STUDY = "shrec07-384", "shrec07-388"
+STUDY = ANIMALS[1:3]
 DISC = "domain=disc"  # closed_maps.py compares it with domains without a seam
 # one change from the default at a time, on one pair
 VARIANTS = {
@@ -44,15 +44,14 @@ VARIANTS = {
         'phi.overrides=["initialization=random","encoding.resolutions=[16,64,256]"]'
     ],
     # of h alone: surfaces and seams are the default's
-    "paper, as many steps": [
+    "h of the paper, as many steps": [
         "experiment=paper",
         "phi.overrides=[]",
         "seam.path=auto",
         "trainer.max_steps=1500",
     ],
 }
-SEAMS = {
-    "auto": [],
+SEAMS = {  # seam.path=auto is the default
     "shortest, all landmarks": ["seam.path=shortest"],
     "hidden, all landmarks": ["seam.path=hidden"],
     "shortest, a third": ["seam.path=shortest", "seam.landmarks=7"],
@@ -66,17 +65,20 @@ def timed(make: Callable[[], Any]) -> tuple[Any, float]:
     return result, round(time.process_time() - start, 1)
 
 
-def pair(source: Any, target: Any, landmarks: Any, overrides: list[str]) -> dict[str, Any]:
-    """Figures of a map; raw meshes become neural surfaces before the clock starts."""
+def mapped(source: str, target: str, landmarks: Any, overrides: list[str]) -> tuple[Any, float]:
+    """A map, and its seconds; the meshes become neural surfaces before the clock starts."""
 
-    def run(settings: list[str]) -> Any:
-        return nsm.map_pair(source, target, landmarks, overrides=settings, progress=False)
+    def run(first: Any, second: Any, marks: Any, settings: list[str]) -> Any:
+        return nsm.map_pair(first, second, marks, overrides=settings, progress=False)
 
-    if isinstance(source, str):
-        f = run([*overrides, "trainer.max_steps=1", DISC])  # fills the cache
-        source, target = f.source, f.target
-        landmarks = f.landmarks.tolist() or None
-    f, seconds = timed(lambda: run(overrides))
+    start = run(source, target, landmarks, [*overrides, "trainer.max_steps=1", DISC])
+    marks = start.landmarks.tolist() or None
+    return timed(lambda: run(start.source, start.target, marks, overrides))
+
+
+def pair(source: str, target: str, landmarks: Any, overrides: list[str]) -> dict[str, Any]:
+    """Figures of a map."""
+    f, seconds = mapped(source, target, landmarks, overrides)
     surfaces = {
         phi.surface.name: {
             "rms_percent": phi.metrics.get("rms_percent"),
@@ -88,51 +90,23 @@ def pair(source: Any, target: Any, landmarks: Any, overrides: list[str]) -> dict
     return {"map_seconds": seconds, "metrics": f.metrics, "surfaces": surfaces}
 
 
+def study_of(meshes: Path) -> tuple[str, str, list[str]]:
+    """The files of the pair that is studied, and of its landmarks."""
+    first, second = (str(meshes / f"{name}.off") for name in STUDY)
+    return first, second, [str(meshes / "landmarks" / f"{name}.vts") for name in STUDY]
+
+
 def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
-    marks = meshes / "landmarks"
-
-    def animal(name: str) -> str:
-        return str(meshes / f"{name}.off")
-
-    def points(*names: str) -> list[str]:
-        return [str(marks / f"{name}.vts") for name in names]
-
-    cat, horse = (str(meshes / f"cat_horse-{k}.obj") for k in (0, 1))
-    both = [str(marks / f"cat_horse-{k}.txt") for k in (0, 1)]
-
-    def collection() -> dict[str, Any]:
-        files = [animal(name) for name in ANIMALS]
-        nsm.map_collection(files, points(*ANIMALS), overrides=["trainer.max_steps=1", DISC])
-        group, seconds = timed(
-            lambda: nsm.map_collection(files, points(*ANIMALS), overrides=[DISC], progress=False)
-        )
-        return {"map_seconds": seconds, "metrics": group.metrics}
-
-    def ordered(i: int, j: int) -> dict[str, Any]:
-        # prepared jointly, as in the collection: the surfaces come from the cache
-        files = [animal(name) for name in ANIMALS]
-        group = nsm.map_collection(
-            files, points(*ANIMALS), overrides=["trainer.max_steps=1", DISC], progress=False
-        )
-        a, b = group.surfaces[i], group.surfaces[j]
-        return pair(a, b, group.landmarks[:, [i, j]].tolist(), [])
-
+    study = study_of(meshes)
     result: dict[str, Callable[[], dict[str, Any]]] = {
-        "cat-horse": lambda: pair(cat, horse, both, []),
-        "horse-cat": lambda: pair(horse, cat, both[::-1], []),
-        "collection": collection,
+        "igea-sphere_cap": lambda: pair(str(meshes / "igea.ply"), "sphere_cap", None, []),
+        "energy: conformal map": lambda: pair(*study, ["energy=conformal"]),
+        "energy: flattening": lambda: by_energy(study[0]),
     }
-    for i, j in itertools.permutations(range(len(ANIMALS)), 2):
-        result[f"{ANIMALS[i][-3:]}-{ANIMALS[j][-3:]}"] = lambda i=i, j=j: ordered(i, j)  # type: ignore[misc]
-    result["igea-sphere_cap"] = lambda: pair(str(meshes / "igea.ply"), "sphere_cap", None, [])
-    study = (*map(animal, STUDY), points(*STUDY))
-    result["energy: conformal map"] = lambda: pair(*study, ["energy=conformal"])
-    result["energy: flattening"] = lambda: by_energy(animal(STUDY[0]))
     for group, variants in (("setting", VARIANTS), ("seam", SEAMS)):
         for name, settings in variants.items():
-            if settings or group == "setting":
-                key = f"{group}: {name}"
-                result[key] = lambda settings=settings: pair(*study, settings)  # type: ignore[misc]
+            key = f"{group}: {name}"
+            result[key] = lambda settings=settings: pair(*study, settings)  # type: ignore[misc]
     for name in ("shrec07-384.off", "cow.obj"):
         for kind in ("free", "fixed"):
             file = str(meshes / name)
@@ -185,8 +159,9 @@ BY_ENERGY = {
     "flipped_percent": "after",
 }
 COLUMNS = {
-    "start_symmetric_dirichlet_median": "median before",
-    "symmetric_dirichlet_median": "median",
+    "start_symmetric_dirichlet_median": "median as h starts",
+    "start_symmetric_dirichlet_p95": "95th percentile",
+    "symmetric_dirichlet_median": "median at the end",
     "symmetric_dirichlet_p95": "95th percentile",
     "flipped_before_repair_percent": "flipped % before repair",
     "flipped_percent": "flipped %",
@@ -205,125 +180,47 @@ FLAT = {
 }
 
 
-def tables() -> str:
-    """All results as Markdown; the distortion is symmetric Dirichlet, 3.98 at best.
+LEAST = "Distortion D_iso is symmetric Dirichlet: 3.98 = 4 - 2ε at best, ε = 0.01."
 
-    Medians before are those of h at its start. A dash is a figure that an older version did not
-    measure.
-    """
+
+def tables() -> str:
+    """All results as Markdown; a dash is a figure that there is none of."""
     files = sorted(RESULTS.glob("*.json"))
     results = {found["case"]: found for found in (json.loads(f.read_text()) for f in files)}
-    maps, changes, flat, energies = [], [], [], []
+    changes, flat, energies = [], [], []
     for label, name in MAPS_BY_ENERGY.items():
         if name in results:
             found = results[name]
-            cells = [*_values(found["metrics"], BY_ENERGY), f"{found['map_seconds']:.0f}"]
+            if not energies:  # h starts alike, whatever the energy
+                energies.append(["map, as h starts", *at_start(found["metrics"], BY_ENERGY), "0"])
+            cells = [*values(found["metrics"], BY_ENERGY), f"{found['map_seconds']:.0f}"]
             energies.append([f"map, {label}", *cells])
     for name, found in results.items():
-        row = [f"{found['map_seconds']:.0f}"]
         if name.startswith("param: "):
             flat += _flat_rows(name.removeprefix("param: "), found["flattening"])
         elif "energies" in found:
             for label, figures in found["energies"].items():
-                time = f"{figures['seconds']:.0f}" if "seconds" in figures else "–"
-                energies.append([f"flattening, {label}", *_values(figures, BY_ENERGY), time])
-        elif name.startswith("energy: "):
-            continue
-        elif name.startswith(("setting: ", "seam: ")):
-            changes.append([name, *_values(found["metrics"], COLUMNS), *row])
-        elif "pairs" not in found["metrics"]:
-            maps.append([name.replace("-", " → "), *_values(found["metrics"], COLUMNS), *row])
-    parts = [table(["map", *COLUMNS.values(), "seconds"], maps)]
-    if "collection" in results:
-        found = results["collection"]
-        rows = [
-            [pair.replace("shrec07-", ""), *_values(metrics, COLUMNS)]
-            for pair, metrics in found["metrics"]["pairs"].items()
-        ]
-        mean, most = (found["metrics"][f"cycle_error_{k}_percent"] for k in ("mean", "max"))
-        parts.append(
-            "The collection of the four animals, all ordered pairs by one training of "
-            f"{found['map_seconds']:.0f} s; cycle error\n{mean:.3f} % of the diagonal in the mean, "
-            f"{most:.2f} % at most:"
-        )
-        parts.append(table(["pair", *COLUMNS.values()], rows))
-    parts.append("One setting changed at a time, on 384 → 388 (cut as a pair):")
-    parts.append(table(["change", *COLUMNS.values(), "seconds"], changes))
+                time = f"{figures.get('seconds', 0):.0f}"
+                energies.append([f"flattening, {label}", *values(figures, BY_ENERGY), time])
+        elif not name.startswith("energy: "):
+            cells = [*values(found["metrics"], COLUMNS), f"{found['map_seconds']:.0f}"]
+            changes.append([name.replace("igea-", "igea → "), *cells])
+    parts = [LEAST]
+    parts.append("Maps on the disc, 384 → 388 (cut as a pair) with one setting changed at a time:")
+    parts.append(table(["map", *COLUMNS.values(), "seconds"], changes))
     if energies:
         parts.append("By the paper's two energies, flattening 384 and 384 → 388 (cut as a pair):")
         parts.append(table(["what", *BY_ENERGY.values(), "seconds"], energies))
-    others = study(results) + baselines(sorted(RESULTS.parent.glob("published-*.json")))
-    if others:
-        parts.append("Maps by other means; composed parameterizations are not optimized:")
-        parts.append(table(["map", *BASELINES.values(), "seconds"], others))
     parts.append("Flattening, beside libigl's methods on the same cut mesh:")
     parts.append(table(["surface", "method", *FLAT.values()], flat))
     return "\n\n".join(parts) + "\n"
 
 
-BASELINES = {
-    "symmetric_dirichlet_median": "median",
-    "symmetric_dirichlet_mean": "mean",
-    "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_before_repair_percent": "flipped % before repair",
-    "flipped_percent": "after",
-    "landmark_error_max_percent": "landmark error, largest",
-}
-
-
-def study(results: dict[str, dict[str, Any]]) -> list[list[str]]:
-    """The study's pair by default, composed, and by the paper's settings of h, on surfaces and
-    seams of the default."""
-    rows, pair = [], "384 → 388"
-    names = {
-        "setting: default": "nsm, default",
-        "setting: paper, as many steps": "the paper's settings of h, 1,500 steps",
-    }
-    for name, label in names.items():
-        if name in results:
-            found = results[name]
-            cells = _values(found["metrics"], BASELINES)
-            rows.append([f"{pair}: {label}", *cells, f"{found['map_seconds']:.0f}"])
-    start = results.get("energy: conformal map", {}).get("metrics", {})
-    if "start_symmetric_dirichlet_median" in start:  # whatever the energy
-        rows.append([f"{pair}: its parameterizations composed", *_start(start), "–"])
-    return rows
-
-
-def baselines(files: list[Path]) -> list[list[str]]:
-    """Maps of each pair that benchmarks/published.py measured, by the default and by other means.
-
-    A map that is not repaired has one share of flips. The published recipe cuts each shape by
-    itself, the default both together.
-    """
-    rows = []
-    for file in files:
-        found = json.loads(file.read_text())
-        for key, entry in found.items():
-            what, _, stage = key.partition("/")
-            if " → " not in what:
-                continue
-            if stage == "default":
-                spent = f"{entry['seconds']:.0f}"
-                rows.append([f"{what}: nsm, default", *_values(entry["metrics"], BASELINES), spent])
-                start = _start(entry["metrics"])
-                rows.append([f"{what}: its parameterizations composed", *start, "–"])
-                continue
-            told = {**entry["metrics"]}
-            told["flipped_before_repair_percent"] = told["flipped_percent"]
-            label = {
-                "before": "parameterizations of the published recipe composed",
-                "published": f"{found['form']}, at its stop",
-            }.get(stage, f"{found['form']}, after the default's time")
-            rows.append([f"{what}: {label}", *_values(told, BASELINES), f"{entry['seconds']:.0f}"])
-    return rows
-
-
-def _start(metrics: dict[str, float]) -> list[str]:
-    """The figures of a map before its optimization, of which nothing is repaired."""
+def at_start(metrics: dict[str, float], columns: dict[str, str]) -> list[str]:
+    """The cells of a map before its optimization, of which nothing is repaired."""
     start = {key.removeprefix("start_"): v for key, v in metrics.items() if key[:6] == "start_"}
     start["flipped_before_repair_percent"] = start["flipped_percent"]
-    return _values(start, BASELINES)
+    return values(start, columns)
 
 
 def _flat_rows(case: str, methods: dict[str, dict[str, float]]) -> list[list[str]]:
@@ -331,10 +228,11 @@ def _flat_rows(case: str, methods: dict[str, dict[str, float]]) -> list[list[str
     names = {"nsm": "nsm, free boundary", "domain": "start: domain Ω"}
     if boundary == "fixed":  # the other methods stand there with the free boundary
         methods, names = {"nsm": methods["nsm"]}, {"nsm": "nsm, bijective onto Ω"}
-    return [[surface, names.get(m, m), *_values(figures, FLAT)] for m, figures in methods.items()]
+    return [[surface, names.get(m, m), *values(figures, FLAT)] for m, figures in methods.items()]
 
 
-def _values(metrics: dict[str, float], columns: dict[str, str]) -> list[str]:
+def values(metrics: dict[str, float], columns: dict[str, str]) -> list[str]:
+    """The cells of a table's row."""
     return [
         f"{metrics[key]:.{2 if key == 'covered_percent' else 3}f}" if key in metrics else "–"
         for key in columns
@@ -359,7 +257,7 @@ def main() -> None:
     RESULTS.mkdir(parents=True, exist_ok=True)
     for name, run in cases(arguments.meshes).items():
         file = RESULTS / f"{name.replace(': ', '-').replace(', ', '-').replace(' ', '_')}.json"
-        if file.exists() or (arguments.only and name not in arguments.only):
+        if name not in arguments.only if arguments.only else file.exists():
             continue
         print(name, flush=True)
         found = {

@@ -28,6 +28,7 @@ import shlex
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +59,20 @@ COLUMNS = {
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
-def figures(source: Mesh, target: Mesh, image: np.ndarray, marks: np.ndarray) -> dict[str, float]:
+def figures(
+    source: Mesh,
+    target: Mesh,
+    image: np.ndarray,
+    marks: np.ndarray,
+    columns: Iterable[str] = tuple(COLUMNS),
+) -> dict[str, float]:
     """Figures of a map of meshes, whoever has made it; both are scaled to one area first.
 
     Args:
         source, target: vertices (V, 3) and faces (F, 3).
         image: (V, 3) points on the target, of the source's vertices; NaN where one has none.
         marks: (L, 2) vertices of source and target.
+        columns: the figures to tell.
     """
     (vertices, faces), (other, other_faces) = source, target
     known = np.isfinite(image[faces]).all(axis=(1, 2))
@@ -81,11 +89,19 @@ def figures(source: Mesh, target: Mesh, image: np.ndarray, marks: np.ndarray) ->
     off *= 100 / np.linalg.norm(np.ptp(other, axis=0))
     found["landmark_error_mean_percent"] = float(off.mean())
     found["landmark_error_max_percent"] = float(off.max())
-    return {key: found[key] for key in COLUMNS if key in found}
+    return {key: found[key] for key in columns if key in found}
 
 
 def by_command(template: str, source: Mesh, target: Mesh, marks: np.ndarray) -> dict[str, float]:
-    """Figures and seconds of the map of another program.
+    """Figures and seconds of the map of another program (see :func:`image_by_command`)."""
+    image, seconds = image_by_command(template, source, target, marks)
+    return {"seconds": seconds, **figures(source, target, image, marks)}
+
+
+def image_by_command(
+    template: str, source: Mesh, target: Mesh, marks: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """The images (V, 3) of the source's vertices by another program, and its seconds.
 
     Raises:
         RuntimeError: it ends with an error, or leaves no image of each vertex.
@@ -107,7 +123,7 @@ def by_command(template: str, source: Mesh, target: Mesh, marks: np.ndarray) -> 
         image = read_image(place)
     if image.shape != source[0].shape:
         raise RuntimeError(f"{words[0]} wrote {image.shape} for {len(source[0])} vertices")
-    return {"seconds": round(seconds, 1), **figures(source, target, image, marks)}
+    return image, round(seconds, 1)
 
 
 def read_image(folder: Path) -> np.ndarray:

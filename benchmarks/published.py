@@ -147,6 +147,14 @@ def _norm(watch: GradientWatch, config: Any, surface: Surface) -> float:
     return samples * sum(watch.recent) / max(1, len(watch.recent))
 
 
+def animals(folder: Path) -> tuple[list[str], list[Any], list[np.ndarray]]:
+    """The files of the two animals, their meshes, and the landmarks as vertices of each."""
+    files = [str(folder / f"{name}.off") for name in NAMES]
+    marks = [str(folder / "landmarks" / f"{name}.vts") for name in NAMES]
+    meshes: list[Any] = [read_shape(file, DOMAINS["disc"], file) for file in files]
+    return files, meshes, list(landmark_vertices(marks, meshes))
+
+
 def overfitted(store: Store, surface: Surface, form: Form, folder: Path) -> Any:
     """The neural surface of an animal by the published recipe, with its figures and those of the
     default on the same cut."""
@@ -271,10 +279,7 @@ def main() -> None:
     card = f"-{_machine().replace(' ', '-')}" if torch.cuda.is_available() else ""
     file = arguments.folder / f"published-{arguments.form}{card}.json"
     store, kept = Store(file, form), cache_folder() / "published" / file.stem
-    files = [str(arguments.meshes / f"{name}.off") for name in NAMES]
-    marks = [str(arguments.meshes / "landmarks" / f"{name}.vts") for name in NAMES]
-    meshes: list[Any] = [read_shape(file, DOMAINS["disc"], file) for file in files]
-    landmarks = landmark_vertices(marks, meshes)
+    files, meshes, landmarks = animals(arguments.meshes)
     surfaces = prepare_jointly(meshes, landmarks, seam="own")  # as experiment=paper does
     phis = [overfitted(store, surface, form, kept) for surface in surfaces]
     mapped(store, phis, landmarks, files, form)

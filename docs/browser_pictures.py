@@ -63,7 +63,7 @@ def tensorboard(folder: str) -> None:
     board = program.TensorBoard()
     board.configure(argv=[None, "--logdir", folder, "--port", "0", "--load_fast=false"])
     address = board.launch()
-    with browser(2100, 700) as window:
+    with browser(2900, 700) as window:
         window.get(f"{address}#hparams")
         time.sleep(READY)
         picture(window, "tensorboard", 64)

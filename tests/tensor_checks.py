@@ -117,6 +117,8 @@ def check_composition(g: SurfaceMap, f: SurfaceMap) -> None:
     np.testing.assert_array_equal(both.inverse(value), f.inverse(g.inverse(value)))
     x = torch.as_tensor(p)
     np.testing.assert_allclose(both.module()(x).numpy(), both(x).numpy(), rtol=1e-6, atol=1e-6)
+    back = both.module().inverse(torch.as_tensor(value))
+    np.testing.assert_allclose(back.numpy(), both.inverse(value), rtol=1e-6, atol=1e-6)
     other = both.module().value_and_jacobian(x)[1].numpy()
     np.testing.assert_allclose(other, jacobian, rtol=1e-4, atol=1e-4)
     there = both.correspondences().take(*g.target.file_mesh())

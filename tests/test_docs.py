@@ -176,7 +176,11 @@ def rows(text):
         ),
         ("activations", "| activation |", ["activation.md"]),
         ("robustness", "<!-- table -->", ["torture.md"]),
-        ("paper", "## The published settings", ["maps.md", "published-reduced.md"]),
+        (
+            "paper",
+            "## The published settings",
+            ["maps.md", "baselines.md", "published-reduced.md", "published_changes.md"],
+        ),
     ],
 )
 def test_tables_hold_what_was_measured(page, heading, files):

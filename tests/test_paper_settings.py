@@ -8,6 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 from nsm.config import compose_config, conf_folder
+from nsm.maps import NeuralMap
 from nsm.tasks.schedules import build_scheduler
 
 TASKS = ("overfit", "param", "pair_map", "collection_map")
@@ -45,7 +46,7 @@ OVERFIT = {
 }
 PARAM = {
     "map.width": (128, TEXT, "h: four layers of 128, softplus"),
-    "map.depth": (3, OURS, "h: four layers of 128, softplus"),
+    "map.depth": (3, TEXT, "h: four layers of 128, softplus"),
     "map.block": ("plain", CODE, "h is a plain MLP pretrained to the identity"),
     "phi.overrides": (["experiment=paper"], TEXT, None),
     "energy._target_": ("nsm.energies.SymmetricDirichlet", TEXT, "Symmetric Dirichlet (Eq. 2)"),
@@ -155,6 +156,13 @@ def test_the_surfaces_of_maps_are_the_papers(task):
     config = paper(task)
     phi = compose_config(["task=overfit", *config.phi.overrides])
     assert phi == paper("overfit")
+
+
+def test_h_has_four_layers_of_128():
+    settings = {k: v for k, v in paper("param").map.items() if k != "_target_"}
+    layers = NeuralMap(out_dim=2, **settings).layers
+    assert [one.in_features for one in layers] == [2, 128, 128, 128, 128]
+    assert [one.out_features for one in layers] == [128, 128, 128, 128, 2]
 
 
 def test_a_setting_on_the_command_line_goes_before_the_papers():

@@ -182,6 +182,15 @@ def test_modules_give_what_their_maps_give(uv):
     given_ = torch.from_numpy(points)
     assert np.allclose(PAIR.module()(given_).numpy(), PAIR(points), atol=1e-6)
     assert np.allclose(PAIR.to("cpu")(points), PAIR(points), atol=1e-12)
+    # of a flattening, the network: at the vertices what a call gives, elsewhere smooth
+    h, vertices = FLAT.module().requires_grad_(True), FLAT.phi.surface.uv
+    assert np.allclose(h(torch.from_numpy(vertices)).detach(), FLAT(vertices), atol=1e-6)
+    value, slopes = h.value_and_jacobian(tensor.requires_grad_())
+    for k in range(2):
+        (gradient,) = torch.autograd.grad(value[:, k].sum(), tensor, retain_graph=True)
+        torch.testing.assert_close(gradient, slopes[:, k], equal_nan=True)
+    value.sum().backward()
+    assert not any(p.requires_grad for p in FLAT.map.parameters())
 
 
 @examples(5)
@@ -724,6 +733,7 @@ PROPERTIES: dict[str, list[Callable]] = {
     "NeuralSurface.save": [test_what_is_saved_is_what_is_loaded],
     "NsmError": [test_errors_are_one_line],
     "Parameterization.__call__": [test_functions_of_the_domain],
+    "Parameterization.module": [test_modules_give_what_their_maps_give],
     "Parameterization.repaired": [test_repaired_maps_are_certified],
     "Parameterization.save": [test_what_is_saved_is_what_is_loaded],
     "Surface.arrays": [test_closed_surfaces_of_any_radii],

@@ -150,11 +150,12 @@ def test_presets_sweep_what_they_say():
 
     for file in sorted((conf_folder() / "sweep").glob("*.yaml")):
         params = yaml.safe_load(file.read_text())["hydra"]["sweeper"]["params"]
-        task = "pair_map" if file.stem == "seam_weight" else "overfit"
+        told = {"seam_weight": "pair_map", "energy": "param"}.get(file.stem, "overfit")
         for override in overrides_of([], params):
             values = list(override.sweep_string_iterator())
             assert len(set(values)) == len(values) > 1
-            compose_config([f"task={task}", f"{override.get_key_element()}={values[-1]}"])
+            words = [f"sweep={file.stem}", f"{override.get_key_element()}={values[-1]}"]
+            assert compose_config(words).task.name == told
 
 
 def test_a_preset_is_a_sweep_without_further_words(tmp_path, here):

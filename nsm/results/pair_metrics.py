@@ -32,7 +32,9 @@ ENERGIES: tuple[Callable[[torch.Tensor, torch.Tensor], torch.Tensor], ...] = (
 # what is said of a map before its optimization
 START = (
     *(f"symmetric_dirichlet_{name}" for name in ("median", "mean", "p95")),
+    "conformal_median",
     "singular_value_ratio_median",
+    "singular_value_ratio_p95",
     "flipped_percent",
     "landmark_error_max_percent",
 )
@@ -135,8 +137,9 @@ def start_figures(
             the map that h starts as.
 
     Returns:
-        symmetric_dirichlet_median, _mean and _p95; singular_value_ratio_median; flipped_percent;
-        landmark_error_max_percent, if there are landmarks: each after ``start_``.
+        symmetric_dirichlet_median, _mean and _p95; conformal_median; singular_value_ratio_median
+        and _p95; flipped_percent; landmark_error_max_percent, if there are landmarks: each after
+        ``start_``.
     """
     part, own = source.part, image_uv[source.of_part]
     figures = distortion_figures(part.vertices, target.at(own), part.faces)

@@ -24,9 +24,9 @@ from nsm.results.surface_map import SurfaceMap
 from nsm.results.textures import GREY
 
 _STRIP, _GIF = 300, 300
-_LEAST, _WORST = LEAST_SYMMETRIC_DIRICHLET, 20.0  # ends of the colour scale
+_LEAST, WORST = LEAST_SYMMETRIC_DIRICHLET, 20.0  # ends of the colour scale
 _TICKS = [_LEAST, 5, 7, 10, 20]
-_SCALE = ScalarMappable(LogNorm(_LEAST, _WORST), "viridis")
+_SCALE = ScalarMappable(LogNorm(_LEAST, WORST), "viridis")
 
 
 def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
@@ -118,9 +118,7 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
     axes.clear()
     axes.set_aspect("auto")
     axes.set_position((0.64, 0.14, 0.24, 0.74))
-    axes.hist(
-        np.clip(value, _LEAST, _WORST), bins=np.geomspace(_LEAST, _WORST, 60), color="#345c8c"
-    )
+    axes.hist(np.clip(value, _LEAST, WORST), bins=np.geomspace(_LEAST, WORST, 60), color="#345c8c")
     axes.set_xscale("log")
     axes.set_xticks(_TICKS, [*map(str, _TICKS[:-1]), f"≥ {_TICKS[-1]}"])
     axes.set_xticks([], minor=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import nn
 
 from nsm.domains import Domain
-from nsm.maps import PlanarMap
+from nsm.maps import Placed, PlanarMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
@@ -53,6 +55,15 @@ class Parameterization:
         s = self.phi.surface
         uv = as_points(uv, 2, "points of the domain")
         return locate(uv, s.uv, s.faces).take(self.uv, s.faces)
+
+    def module(self) -> Placed:
+        """h as a torch module from Ω to the plane, (N, 2) to (N, 2), with ``value_and_jacobian``.
+
+        It is the network: smooth, and without :attr:`correction`, while the map of a call is linear
+        on triangles. Values are in the units of :attr:`uv`. Its weights are a copy, frozen:
+        ``module().requires_grad_(True)`` trains them, and leaves this map as it is.
+        """
+        return copy.deepcopy(Placed(self.map, 1.0, torch.zeros(2)))
 
     @cached_property
     def uv(self) -> np.ndarray:

@@ -9,7 +9,7 @@ of the piece, and jumps between pieces.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
@@ -100,6 +100,12 @@ class SurfaceMapModule(nn.Module):
 
 class MapSequence(nn.Sequential):
     """Modules of maps one after the other, as ``(g @ f).module()`` makes it."""
+
+    def inverse(self, points: Tensor) -> Tensor:
+        """As :meth:`SurfaceMapModule.inverse`: the last map's inverse comes first."""
+        for f in reversed(cast(Sequence[SurfaceMapModule], self)):
+            points = f.inverse(points)
+        return points
 
     def value_and_jacobian(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """As :meth:`SurfaceMapModule.value_and_jacobian`, by the chain rule."""

@@ -34,7 +34,7 @@ class Reliability(NamedTuple):
 
     Attributes:
         distortion: symmetric Dirichlet of the map, the mean over the triangles around the vertex,
-            weighted by area; 4 at best. It is scale-free: both surfaces have the area of Ω.
+            weighted by area; 3.98 at best. It is scale-free: both surfaces have the area of Ω.
         stretch: the smallest factor by which a triangle around the vertex stretches a length, in
             units of the target's file per unit of the source's; negative where one is flipped.
         landmark_distance: to the nearest landmark along the edges of the source, in the units of

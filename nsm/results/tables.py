@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
@@ -48,7 +48,7 @@ def comparison_table(metrics: Mapping[str, Mapping[str, float]]) -> Table:
 
     D_iso is symmetric Dirichlet (METHOD, Eq. 2), D_conf the conformal energy (Eq. 3).
     """
-    table = _narrow("map", _MAP_COLUMNS.values())
+    table = narrow(Column("map", no_wrap=True), _MAP_COLUMNS.values())
     for name, figures in metrics.items():
         shown = (_brief(figures, key) for key in _MAP_COLUMNS)
         table.add_row(_METHODS.get(name, name), *shown)
@@ -174,7 +174,7 @@ def collection_table(metrics: Mapping[str, Any]) -> Table:
     are of symmetric Dirichlet."""
     every = {key for figures in metrics["pairs"].values() for key in figures}
     columns = {key: label for key, label in _COLLECTION_COLUMNS.items() if key in every}
-    table = _narrow("pair", columns.values())
+    table = narrow(Column("pair", no_wrap=True), columns.values())
     for name, figures in metrics["pairs"].items():
         shown = (_brief(figures, key) for key in columns)
         table.add_row(name, *shown)
@@ -197,7 +197,7 @@ def _brief(figures: Mapping[str, float], key: str) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:#.4g}"
 
 
-def _narrow(first: str, headings: Iterable[str]) -> Table:
+def narrow(first: Column, headings: Iterable[str]) -> Table:
     """A table whose headings, and names of rows, break between words, to fit a terminal of 80
     columns; figures do not."""
     table = Table(first, padding=(0, 1, 0, 0))

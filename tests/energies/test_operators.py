@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from map_samples import network as neural_map
 from thorough import examples
 
+import nsm
 from nsm.energies import operators
 
 U, V = 0, 1
@@ -209,6 +210,27 @@ def test_on_a_mesh_robust_laplacian_finds_the_same():
     theirs = -(stiffness @ f(uv).numpy()) / mass.diagonal()
     difference = (theirs - got)[interior]
     assert np.sqrt((difference**2).mean()) < 0.01 * np.abs(got).max()
+
+
+def test_on_the_neural_surface_of_a_sphere_both_find_the_same():
+    settings = ["encoding.degree=3", "encoding.resolutions=[8,16]", "trainer.max_steps=0"]
+    phi = nsm.overfit(nsm.Surface.load("hemisphere"), overrides=settings, progress=False)
+    uv, module = torch.as_tensor(phi.surface.uv), phi.module().double()
+    interior = np.linalg.norm(phi.surface.uv, axis=1) < 0.9
+    H, K, *_ = (part.numpy()[interior] for part in operators.curvatures(module, uv))
+    assert np.abs(K - 1).max() < 0.2 and np.abs(H + 1).max() < 0.1  # of the unit sphere
+    vertices, faces = module(uv).numpy(), phi.surface.faces
+    mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal()
+    z = vertices[:, 2]
+    got = operators.laplace_beltrami(module, lambda y: module(y)[:, 2], uv).numpy()
+    assert np.abs(got + 2 * z)[interior].max() < 0.1  # -Δz = 2 z, a spherical harmonic
+    stiffness, weights = robust_laplacian.mesh_laplacian(vertices, faces)
+    for theirs in (igl.cotmatrix(vertices, faces) @ z / mass, -stiffness @ z / weights.diagonal()):
+        assert np.sqrt(((theirs - got)[interior] ** 2).mean()) < 0.01
+    theirs = (igl.gaussian_curvature(vertices, faces) / mass)[interior]
+    assert np.sqrt(((theirs - K) ** 2).mean()) < 0.01
+    n = operators.normals(module, uv).numpy()
+    assert (n * igl.per_vertex_normals(vertices, faces)).sum(axis=1)[interior].min() > 0.999
 
 
 @pytest.mark.parametrize("uv", [torch.zeros(3), torch.zeros(3, 3), torch.zeros(3, 2).long()])

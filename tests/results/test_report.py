@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 
 from nsm.commands import report
@@ -24,7 +25,7 @@ from nsm.results import load_surface
 from nsm.results.metrics import evaluate
 from nsm.results.report import write_report
 from nsm.results.report.labels import labels, over_seeds
-from nsm.results.report.runs import find_runs
+from nsm.results.report.runs import Run, find_runs
 from nsm.results.report.sweep import write_sweep
 
 TINY = [
@@ -324,13 +325,34 @@ def test_the_page_has_the_axis_of_the_runs_upwards(tmp_path):
     assert content(tmp_path / "report.html")["up"] == "x"
 
 
+def test_jobs_are_called_by_the_settings_that_tell_them_apart():
+    def told(*jobs):
+        runs = [Run(Path("x"), str(k), "overfit", "", one, {}) for k, one in enumerate(jobs)]
+        return labels(runs)
+
+    # options, each with its parameters
+    softplus = {"activation": "softplus", "activation.beta": 10.0}
+    assert told(softplus, {"activation": "relu"}) == ["activation=softplus", "activation=relu"]
+    # parameters of one class, which are those of an option by chance
+    wide = {"map": "mlp", "map.width": 64, "map.depth": 4}
+    deep = {"map": "NeuralMap", "map.width": 64, "map.depth": 1}
+    thin = {"map": "NeuralMap", "map.width": 32, "map.depth": 1}
+    names = ["width=64, depth=4", "width=64, depth=1", "width=32, depth=1"]
+    assert told(wide, deep, thin) == names
+    # neither follows from the other
+    rates = [{"optimizer": n, "optimizer.lr": r} for n in ("Adam", "SGD") for r in (0.1, 0.2)]
+    assert told(*rates)[0] == "optimizer=Adam, lr=0.1"
+    assert len(set(told(*rates))) == 4
+
+
 def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_path):
     sweep = tmp_path / "sweep-activation"
     for name in ("1", HOSTILE):
         shutil.copytree(runs / "sweep" / name, sweep / str(len(name)))
     table = write_sweep(sweep)
     names = ["hemisphere, activation=relu", "hemisphere, activation=silu"]
-    assert list(table.columns[0].cells) == names
+    # what all jobs are of stands above the table
+    assert [f"{table.title}, {cell}" for cell in table.columns[0].cells] == names
     with (sweep / "sweep.csv").open() as stream:
         rows = {row["job"]: row for row in csv.DictReader(stream)}
     assert set(rows) == set(names)
@@ -344,6 +366,25 @@ def test_a_sweep_ends_with_a_figure_and_a_table_that_the_report_shows(runs, tmp_
     assert shown["name"] == "sweep-activation"
     data = base64.b64decode(shown["picture"].split(",")[1])
     assert Image.open(io.BytesIO(data)).width >= 900
+
+
+def test_a_sweep_of_the_seams_weight_shows_the_gap_and_the_landmarks(runs, tmp_path):
+    gaps = {"0": 1.25, "1000": 0.125}
+    for weight, gap in gaps.items():
+        job = tmp_path / weight
+        shutil.copytree(runs / "map", job)
+        config = OmegaConf.load(job / "config.yaml")
+        config.loss_weights.seam = float(weight)
+        OmegaConf.save(config, job / "config.yaml")
+        stored = json.loads((job / "metrics.json").read_text())
+        stored["metrics"] |= {"seam_gap_mean_percent": gap, "landmark_error_max_percent": 2 * gap}
+        (job / "metrics.json").write_text(json.dumps(stored))
+    table = write_sweep(tmp_path, figure=False)
+    cells = {str(column.header): list(column.cells) for column in table.columns}
+    assert cells["job"] == ["seam=0.0", "seam=1000.0"]
+    (gap,) = (shown for name, shown in cells.items() if "seam" in name)
+    (marks,) = (shown for name, shown in cells.items() if "landmark" in name)
+    assert gap == ["1.250", "0.125"] and marks == ["2.500", "0.250"]
 
 
 def test_a_view_is_upright_for_any_axis(page):

@@ -45,16 +45,10 @@ def labels(runs: Sequence[Run]) -> list[str]:
     are not unique."""
     different = differing(runs)
     last = Counter(key.rsplit(".", 1)[-1] for key in different)
+    telling = _telling(runs, different)
     result = []
     for run in runs:
-        # the choice of a group stands for its parameters
-        chosen = [
-            key
-            for key in different
-            if isinstance(run.settings.get(key), (str, int, float))
-            and key.rpartition(".")[0] not in different
-            and key not in _INPUTS
-        ]
+        chosen = [key for key in telling if isinstance(run.settings.get(key), (str, int, float))]
         short = {key: key.rsplit(".", 1)[-1] for key in chosen[:_CHOICES]}
         parts = [
             f"{end if last[end] == 1 else key}={_brief(run.settings[key])}"
@@ -66,6 +60,27 @@ def labels(runs: Sequence[Run]) -> list[str]:
         text if text and count[text] == 1 else f"{text} ({run.name})" if text else run.name
         for text, run in zip(result, runs, strict=True)
     ]
+
+
+def _telling(runs: Sequence[Run], different: Sequence[str]) -> list[str]:
+    """The settings that differ, but for what runs are of and for what others say already.
+
+    A group's choice stands for its parameters, or they for it, where the one follows from the
+    other; else both are told.
+    """
+    said: set[str] = set(_INPUTS)
+    for group in different:
+        inner = [key for key in different if key.startswith(f"{group}.")]
+        if not inner:
+            continue
+        choices = [json.dumps(run.settings.get(group)) for run in runs]
+        parameters = [json.dumps([run.settings.get(key) for key in inner]) for run in runs]
+        both = len(set(zip(choices, parameters, strict=True)))
+        if len(set(choices)) == both:
+            said.update(inner)
+        elif len(set(parameters)) == both:
+            said.add(group)
+    return [key for key in different if key not in said]
 
 
 def over_seeds(runs: Sequence[Run]) -> list[OverSeeds]:

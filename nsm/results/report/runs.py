@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,11 +89,17 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[Incomplete]]:
 def run_folders(folder: Path) -> Iterator[Path]:
     """The folders of runs, complete or not, in a folder and its subfolders."""
     for path, inner, files in os.walk(folder):
-        inner.sort(key=lambda name: (len(name), name) if name.isdigit() else (0, name))
+        inner.sort(key=_by_number)
         if not {"metrics.json", "config.yaml", "error.txt"}.isdisjoint(files):
             yield Path(path)
         if "metrics.json" in files:
             inner.clear()  # subfolders of a run belong to it
+
+
+def _by_number(name: str) -> list[str | float]:
+    """A key for sorting: numbers in a name by their value, so that 32 comes before 128."""
+    parts = re.split(r"(\d+(?:\.\d+)?)", name)
+    return [float(part) if k % 2 else part for k, part in enumerate(parts)]
 
 
 def _unfinished(folder: Path) -> str:

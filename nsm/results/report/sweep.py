@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.table import Column, Table
 
+from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
 from nsm.errors import NsmError
 from nsm.results.artifact import load_surface
 from nsm.results.collection import load_collection
 from nsm.results.files import atomic_write
 from nsm.results.metrics import evaluate
-from nsm.results.pair_pictures import distorted
+from nsm.results.pair_pictures import WORST, distorted
 from nsm.results.parameterization import load_parameterization
 from nsm.results.pictures import checked, fine, layout_image, panels, save_figure
 from nsm.results.render import Blend, View, vertex_normals
@@ -23,11 +24,11 @@ from nsm.results.report.labels import OverSeeds, labels, over_seeds
 from nsm.results.report.runs import Run, find_runs
 from nsm.results.stored_map import load_surface_map
 from nsm.results.surface_map import SurfaceMap
-from nsm.results.tables import FIGURES
+from nsm.results.tables import FIGURES, narrow
 from nsm.results.textures import GREY
 
 FIGURE, TABLE = "sweep.png", "sweep.csv"
-_ROWS, _LINES = 16, 40  # at most, in the figure and in what is printed
+_ROWS, _LINES = 24, 40  # at most, in the figure and in what is printed
 _SIDE = 420
 # of the table that is printed; the file has all figures
 _PRINTED = {
@@ -35,6 +36,8 @@ _PRINTED = {
     "": (
         "symmetric_dirichlet_median",
         "singular_value_ratio_median",
+        "landmark_error_max_percent",
+        "seam_gap_mean_percent",
         "flipped_before_repair_percent",
         "flipped_percent",
     ),
@@ -89,8 +92,10 @@ def _write_table(file: Path, runs: Sequence[Run], names: Sequence[str]) -> None:
 def _table(runs: Sequence[Run], names: Sequence[str]) -> Table:
     chosen = [_PRINTED.get(run.task, _PRINTED[""]) for run in runs]
     keys = [k for k in dict.fromkeys(sum(chosen, ())) if any(k in run.figures for run in runs)]
+    names, subject = _without_subject(runs, names)
     # names of jobs are not cut short: the ends tell them apart
-    table = Table(Column("job", overflow="fold"), *(" ".join(FIGURES[key]).strip() for key in keys))
+    table = narrow(Column("job", overflow="fold"), (" ".join(FIGURES[k]).strip() for k in keys))
+    table.title = subject
     groups = over_seeds(runs)
     grouped = {number: group for group in groups for number in group.runs}
     for number, (run, name) in list(enumerate(zip(runs, names, strict=True)))[:_LINES]:
@@ -98,10 +103,19 @@ def _table(runs: Sequence[Run], names: Sequence[str]) -> Table:
         if group is None:
             table.add_row(name, *(_number(run.figures.get(key)) for key in keys))
         elif group.runs[0] == number:
-            table.add_row(f"{group.label}, {len(group.runs)} seeds", *_with_deviations(group, keys))
+            label = group.label.removeprefix(f"{subject}, ")
+            table.add_row(f"{label}, {len(group.runs)} seeds", *_with_deviations(group, keys))
     if len(runs) > _LINES:
         table.caption = f"the first {_LINES} of {len(runs)} jobs; {TABLE} has all"
     return table
+
+
+def _without_subject(runs: Sequence[Run], names: Sequence[str]) -> tuple[list[str], str | None]:
+    """The names without what all runs are of, and that; None: they are not of the same."""
+    first = runs[0].subject
+    if any(run.subject != first for run in runs):
+        return list(names), None
+    return [name.removeprefix(f"{first}, ") for name in names], first
 
 
 def _with_deviations(group: OverSeeds, keys: Sequence[str]) -> list[str]:
@@ -154,7 +168,7 @@ def _param(folder: Path, trust: Sequence[str]) -> _Panels:
     return [
         (picture, "checkerboard"),
         (layout, "flattened"),
-        (distorted(view, surface, flat), "symmetric Dirichlet, 4 to 20"),
+        (distorted(view, surface, flat), _scale(result.metrics["nsm"])),
     ]
 
 
@@ -171,15 +185,20 @@ def _pair(f: SurfaceMap) -> _Panels:
     source = f.source.surface
     view, image = View(source.vertices, _SIDE), f.aligned_image
     other = View(image, _SIDE, frame=view.frame)
-    board = checked(source.uv)
+    board, title = checked(source.uv), f"its image on {f.target.surface.name}"
+    if "seam_gap_mean_percent" in f.metrics:
+        title += f": gap across the seam {f.metrics['seam_gap_mean_percent']:.3g} %"
     return [
         (view.draw(source.vertices, source.faces, board, source.seam_pairs), source.name),
-        (
-            other.draw(image, source.faces, board, source.seam_pairs),
-            f"its image on {f.target.surface.name}",
-        ),
-        (distorted(view, source, f.image), "symmetric Dirichlet, 4 to 20"),
+        (other.draw(image, source.faces, board, source.seam_pairs), title),
+        (distorted(view, source, f.image), _scale(f.metrics)),
     ]
+
+
+def _scale(metrics: Mapping[str, float]) -> str:
+    """What the colours of the distortion say, and its median."""
+    ends = f"{LEAST_SYMMETRIC_DIRICHLET} to {WORST:.0f}"
+    return f"symmetric Dirichlet, {ends}: median {metrics['symmetric_dirichlet_median']:.3f}"
 
 
 _DRAW: dict[str, Callable[[Path, Sequence[str]], _Panels]] = {
