@@ -15,9 +15,10 @@ from nsm.surfaces.geometry import edge_graph
 _FACES = 1000
 _TIPS = 8
 _SAMPLES = 64
-_MOST = 9  # tips and given landmarks
+_MOST = 9  # tips and given landmarks, where all may be cones
 _AROUND = 0.3  # a tip's neighbourhood, over √area
 _LEVEL = 0.02  # mean distances that differ less are alike, over √area
+COMMON = 5  # given landmarks from which on four of them are the cones of both
 _NEAR = 0.15  # of a tip to a landmark that is given, over √area
 
 
@@ -55,6 +56,10 @@ class CoarseShape:
         around = self.distance[self.tips] < _AROUND
         height = np.where(around, self.mean_distance, 0.0).max(axis=1)
         return self.tips[self.mean_distance[self.tips] > height - _LEVEL]
+
+    def free_peaks(self) -> np.ndarray:
+        """Those of them that were not given."""
+        return np.setdiff1d(self.peaks(), self.fixed)
 
     def spread_tips(self, count: int) -> np.ndarray:
         """Numbers of up to ``count`` tips that are far from each other."""
@@ -96,7 +101,10 @@ def coarse_shape(
         if fixed is not None and given:
             unit = np.sqrt(topology.face_areas(vertices, faces).sum())
             apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
-            tips = np.concatenate([fixed, tips[apart > _NEAR][: _MOST - given]])
+            others = tips[apart > _NEAR]
+            if given < COMMON:
+                others = others[: _MOST - given]
+            tips = np.concatenate([fixed, others])
     if len(tips) < 4:
         raise NsmError(
             f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",
