@@ -37,8 +37,7 @@ from scipy.spatial import cKDTree
 
 import nsm
 from nsm.correspondence import proposed
-from nsm.correspondence.coarse_shape import edge_distances
-from nsm.correspondence.preview import previewed
+from nsm.correspondence.distances import edge_distances
 from nsm.correspondence.search import Candidate
 from nsm.domains.orbifold.common_cones import far_apart
 from nsm.domains.orbifold.cover import located

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
 
-from nsm.domains.orbifold.cones import decimated, extremities
+from nsm.correspondence.distances import edge_distances
+from nsm.correspondence.tips import tips_of
+from nsm.domains.orbifold.cones import decimated
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.geometry import edge_graph
 
 _FACES = 1000
 _TIPS = 8
@@ -97,7 +97,7 @@ def coarse_shape(
         )
     given = 0 if fixed is None else len(fixed)
     if tips is None:
-        tips = extremities(vertices, faces, _TIPS)
+        tips = tips_of(vertices, faces, _TIPS)
         if fixed is not None and given:
             unit = np.sqrt(topology.face_areas(vertices, faces).sum())
             apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
@@ -128,13 +128,6 @@ def coarse_shape(
         _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
         given,
     )
-
-
-def edge_distances(
-    vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray | None = None
-) -> np.ndarray:
-    """Lengths (S, V) of shortest paths along edges, from sources (S,) or from all vertices."""
-    return np.asarray(dijkstra(edge_graph(vertices, faces), directed=False, indices=sources))
 
 
 def _spread(distance: np.ndarray, chosen: list[int], count: int) -> np.ndarray:

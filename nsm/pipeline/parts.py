@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.distances import edge_distances
 from nsm.domains import Domain
 from nsm.domains.automatic import is_part_of_whole
 from nsm.domains.joint_preparation import Mesh

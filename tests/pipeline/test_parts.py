@@ -11,7 +11,7 @@ import trimesh
 from domains.orbifold.shapes import limbs
 
 import nsm
-from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.distances import edge_distances
 from nsm.errors import NsmError
 from nsm.pipeline.parts import relative_scale
 from nsm.results.textures import GREY
