@@ -22,7 +22,7 @@ _SAME, _APART = 0.1, 0.2  # a tip that is nearer to another, over √area
 def tips_of(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
     """Up to ``count`` tips (K,) of a closed mesh (V, 3), (F, 3).
 
-    They are the extremities, and ends of limbs at which none of these is.
+    They are the extremities. Those beside an end of a limb at which none is give way to it.
     """
     far = extremities(vertices, faces, count)
     coarse, ids = decimated(vertices, faces, _FACES, far)
@@ -35,7 +35,7 @@ def tips_of(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
     apart = edge_distances(points, coarse, others)[:, limbs] / root
     missed = apart.min(axis=0) > _SAME
     near = (apart[:, missed] < _APART).any(axis=1)
-    return ids[np.concatenate([limbs[missed], others[~near]])[:count]]
+    return ids[np.concatenate([others[~near], limbs[missed]])[:count]]
 
 
 def mean_distances(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
