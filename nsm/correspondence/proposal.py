@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
+from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
-from nsm.errors import NsmError
 
 # two maps differ if their images are this far apart in the mean, over √area, or if they take an end
 # of a limb to ends of two limbs
@@ -84,12 +83,6 @@ def proposed(
     """
     meshes = (source, target)
     shapes = [coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)]
-    if len(given) >= COMMON and not all(len(s.free_peaks()) for s in shapes):
-        raise NsmError(
-            "the given landmarks are at all tips of a surface",
-            kind="no_proposal",
-            key="landmarks",
-        )
     kept = hypotheses(*shapes)
     margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
     return Proposal(kept, margin, len(given))

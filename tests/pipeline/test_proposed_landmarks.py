@@ -133,6 +133,15 @@ def test_nine_given_landmarks_are_complete(monkeypatch):
     assert (len(ids[0]), found, said.strip()) == (9, None, "")
 
 
+def test_nothing_is_said_where_nothing_is_left_to_complete(monkeypatch):
+    def all_given(source, target, given):
+        return Proposal([Hypothesis(given, 2.0, True, None)], np.inf)
+
+    monkeypatch.setattr(proposed_landmarks, "proposed", all_given)
+    ids, found, said = take([[100 + k, 201 + k] for k in range(5)])
+    assert (len(ids[0]), found, "proposed" in said) == (5, None, False)
+
+
 PLACES = [[[0, 0.2, 0.3, 0.5], [7, 0.5, 0.5, 0.0]], [[4, 0.1, 0.1, 0.8], [9, 0.0, 1.0, 0.0]]]
 
 
