@@ -71,7 +71,7 @@ def closed_parts(
         return list(shapes)
     if not len(landmarks[0]):
         raise NsmError(
-            f"{part.name} is open, {whole.name} is closed, and without landmarks nothing says where "
+            f"{part.name} is open, {whole.name} is closed: without landmarks nothing says where "
             f"the part belongs; give {_CONES} landmarks or more that are on the part",
             kind="too_few_landmarks",
             key="landmarks",
