@@ -223,7 +223,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
             axes.plot(every, share, label=f"{row}, {len(chosen)} pairs")
     axes.set(xlim=(0, 0.3), ylim=(0, 100), xlabel="geodesic error / √area", ylabel="landmarks, %")
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(loc="center right", bbox_to_anchor=(1, 0.64), fontsize=8)
     figure.tight_layout()
     figure.savefig(PICTURE, dpi=120)
     plt.close(figure)
