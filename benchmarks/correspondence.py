@@ -8,7 +8,7 @@ annotated one, over the square root of the area. Landmarks that are given are no
 the coarse ones, before any training on the full meshes, but for the rows with ``full map``.
 
 Rows: ``none``: no landmarks; ``given N``: the N annotated landmarks that are farthest from each
-other, up to four completed by proposals; ``..., full map``: the map that ``experiment=fast``
+other, completed by proposals; ``..., full map``: the map that ``experiment=fast``
 trains; ``zoomout``: wave kernel signatures and ZoomOut; ``icp``: the best of 24 rotations with
 iterated closest points, then ZoomOut. The last two are pyfmaps' (nsm[peers]), on meshes of 3,000
 triangles.
@@ -37,8 +37,7 @@ from scipy.spatial import cKDTree
 
 import nsm
 from nsm.correspondence import proposed
-from nsm.correspondence.coarse_shape import edge_distances
-from nsm.correspondence.preview import previewed
+from nsm.correspondence.distances import edge_distances
 from nsm.correspondence.search import Candidate
 from nsm.domains.orbifold.common_cones import far_apart
 from nsm.domains.orbifold.cover import located
@@ -123,15 +122,6 @@ def without(source: Annotated, target: Annotated, given: int = 0) -> dict[str, A
     }
 
 
-def through(source: Annotated, target: Annotated, given: int) -> dict[str, Any]:
-    """The coarse map that is drawn through five landmarks or more."""
-    pick = farthest(source, target, given)
-    marks = source.landmarks[pick], target.landmarks[pick]
-    found = previewed(source.mesh, target.mesh, marks, drawn=True).candidate
-    rest = np.setdiff1d(np.arange(len(source.landmarks)), pick)
-    return {"errors": target.errors(images(found, source, target)[rest], rest)}
-
-
 def full_map(source: Annotated, target: Annotated, given: int = 0) -> dict[str, Any]:
     """The map that a user gets from both meshes and the landmarks that are given."""
     pick = farthest(source, target, given)
@@ -166,7 +156,7 @@ def peer(
 
 ROWS: dict[str, Row] = {
     "none": without,
-    **{f"given {n}": partial(without if n <= 4 else through, given=n) for n in GIVEN},
+    **{f"given {n}": partial(without, given=n) for n in GIVEN},
     "none, full map": full_map,
     "given 5, full map": partial(full_map, given=5),
     "zoomout": partial(peer, method=zoomout_map),
@@ -233,7 +223,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
             axes.plot(every, share, label=f"{row}, {len(chosen)} pairs")
     axes.set(xlim=(0, 0.3), ylim=(0, 100), xlabel="geodesic error / √area", ylabel="landmarks, %")
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(loc="center right", bbox_to_anchor=(1, 0.64), fontsize=8)
     figure.tight_layout()
     figure.savefig(PICTURE, dpi=120)
     plt.close(figure)

@@ -31,7 +31,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import nsm
-from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.distances import edge_distances
 from nsm.domains.orbifold.cones import decimated
 from nsm.results.meshes import by_position
 from nsm.results.pictures import PANEL, panels, save_figure

@@ -262,8 +262,8 @@ class ProposalSettings:
     Args:
         strict: end with an error where the proposal is not sure, before any training.
         alternative: which proposal is taken: 0 the best, 1 the second best.
-        complete: one to four given landmarks are completed by proposed ones; to four, only where
-            these are sure.
+        complete: one to eight given landmarks are completed by proposed ones; to four or more, only
+            where these are sure.
     """
 
     strict: bool = False

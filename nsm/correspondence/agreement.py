@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.distances import edge_distances
 
 FEWEST = 5  # landmarks: three distances of a landmark say nothing of it
 # of the distances to the others: below the first and above the second, a landmark is elsewhere.

@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
 
-from nsm.domains.orbifold.cones import decimated, extremities
+from nsm.correspondence.distances import edge_distances
+from nsm.correspondence.tips import tips_of
+from nsm.domains.orbifold.cones import decimated
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.geometry import edge_graph
 
 _FACES = 1000
 _TIPS = 8
 _SAMPLES = 64
-_MOST = 9  # tips and given landmarks
+_MOST = 9  # tips and given landmarks, where all may be cones
 _AROUND = 0.3  # a tip's neighbourhood, over √area
 _LEVEL = 0.02  # mean distances that differ less are alike, over √area
+COMMON = 5  # given landmarks from which on four of them are the cones of both
 _NEAR = 0.15  # of a tip to a landmark that is given, over √area
 
 
@@ -56,6 +57,10 @@ class CoarseShape:
         height = np.where(around, self.mean_distance, 0.0).max(axis=1)
         return self.tips[self.mean_distance[self.tips] > height - _LEVEL]
 
+    def free_peaks(self) -> np.ndarray:
+        """Those of them that were not given."""
+        return np.setdiff1d(self.peaks(), self.fixed)
+
     def spread_tips(self, count: int) -> np.ndarray:
         """Numbers of up to ``count`` tips that are far from each other."""
         apart = self.distance[np.ix_(self.tips, self.tips)]
@@ -92,11 +97,14 @@ def coarse_shape(
         )
     given = 0 if fixed is None else len(fixed)
     if tips is None:
-        tips = extremities(vertices, faces, _TIPS)
+        tips = tips_of(vertices, faces, _TIPS)
         if fixed is not None and given:
             unit = np.sqrt(topology.face_areas(vertices, faces).sum())
             apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
-            tips = np.concatenate([fixed, tips[apart > _NEAR][: _MOST - given]])
+            others = tips[apart > _NEAR]
+            if given < COMMON:
+                others = others[: _MOST - given]
+            tips = np.concatenate([fixed, others])
     if len(tips) < 4:
         raise NsmError(
             f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",
@@ -120,13 +128,6 @@ def coarse_shape(
         _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
         given,
     )
-
-
-def edge_distances(
-    vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray | None = None
-) -> np.ndarray:
-    """Lengths (S, V) of shortest paths along edges, from sources (S,) or from all vertices."""
-    return np.asarray(dijkstra(edge_graph(vertices, faces), directed=False, indices=sources))
 
 
 def _spread(distance: np.ndarray, chosen: list[int], count: int) -> np.ndarray:

@@ -39,8 +39,8 @@ def left_apart(candidate: Candidate) -> np.ndarray:
     """
     source, target = candidate.source.shape, candidate.target.shape
     cones = candidate.cones()
-    ours = np.setdiff1d(source.peaks(), [*cones[:, 0], *source.fixed])
-    theirs = np.setdiff1d(target.peaks(), [*cones[:, 1], *target.fixed])
+    ours = np.setdiff1d(source.free_peaks(), cones[:, 0])
+    theirs = np.setdiff1d(target.free_peaks(), cones[:, 1])
     apart = target.distance[np.ix_(candidate.images(ours), theirs)]
     rows, columns = linear_sum_assignment(apart)
     return np.stack([ours[rows], theirs[columns]], axis=1)

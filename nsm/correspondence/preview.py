@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.correspondence.coarse_shape import coarse_shape
-from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
-from nsm.correspondence.search import NOTHING, Candidate, Round, trained
+from nsm.correspondence.search import Candidate, Round, through_four, trained
 from nsm.errors import NsmError
 
 _ROUND = Round(8, 8, 60)
@@ -37,15 +36,12 @@ def previewed(
     source: tuple[np.ndarray, np.ndarray],
     target: tuple[np.ndarray, np.ndarray],
     landmarks: tuple[np.ndarray, np.ndarray],
-    drawn: bool = False,
 ) -> Preview:
     """The coarse map of two closed surfaces of genus 0 through four of their landmarks.
 
     Args:
         source, target: vertices (V, 3) and faces (F, 3).
         landmarks: vertices (L,) of both, four or more.
-        drawn: whether the map is drawn to the other landmarks too, which then tell less of how well
-            they fit.
 
     Raises:
         NsmError: ``too_few_landmarks``, ``wrong_topology``, or ``not_injective`` where four
@@ -60,29 +56,10 @@ def previewed(
         )
     # both meshes keep all landmarks; the coarse shapes name them by their places among tips
     s, t = coarse_shape(*source, tips=ours), coarse_shape(*target, tips=theirs)
-    most = s.spread_tips(_MOST)
-    sets, first = quick_scores(s, most)
-    second = quick_scores(t, most)[1]
-    best = sets[int((first + second).argmin())]
-    a, b = layout(s, best), layout(t, best)
-    if a is None or b is None:
-        raise NsmError(
-            "the landmarks lie too close to each other for a coarse map",
-            kind="not_injective",
-            key="landmarks",
-        )
-    looked_up = table(b)
-    nothing = np.zeros((0, 2))
-    starts = [
-        Candidate(a, b, looked_up, matrix, shift, 0, nothing, 0.0)
-        for matrix, shift in affine_maps(a, b)
-    ]
-    wanted = np.stack([s.tips[best], t.tips[best]], axis=1)
-    starts = [c for c in starts if np.array_equal(c.cones(), wanted)]
-    held = np.stack([s.tips, t.tips], axis=1) if drawn else NOTHING
-    found = trained(starts, _ROUND, held)
+    starts = through_four(s, t, s.spread_tips(_MOST))
+    found = trained(starts, _ROUND)
     off = [t.distance[c.images(s.tips), t.tips] for c in found]
     # the isotopy class that other landmarks tell, and distortion
     costs = [np.log(c.energy) + 4 * miss.mean() for c, miss in zip(found, off, strict=True)]
     k = int(np.argmin(costs))
-    return Preview(found[k], best, found[k].energy, off[k])
+    return Preview(found[k], found[k].source.tips, found[k].energy, off[k])

@@ -11,7 +11,9 @@ from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
 
-_DIFFERENT = 0.2  # mean distance of two maps' images, over √area, from which they are two
+# two maps differ if their images are this far apart in the mean, over √area, or if they take an end
+# of a limb to ends of two limbs
+_DIFFERENT = 0.2
 _KEPT = 5
 _NEAR = 0.1  # of a tip's image to the tip that corresponds to it, over √area
 LEAST_LANDMARKS = 4  # for common cones
@@ -72,7 +74,7 @@ def proposed(
 
     Args:
         source, target: vertices (V, 3) and faces (F, 3).
-        given: (G, 2) corresponding vertices of both, up to four, which are kept and completed.
+        given: (G, 2) corresponding vertices of both, which are kept and completed.
 
     Raises:
         NsmError: ``wrong_topology`` or ``no_proposal``, see
@@ -80,7 +82,8 @@ def proposed(
             :func:`nsm.correspondence.search.candidates`.
     """
     meshes = (source, target)
-    kept = hypotheses(*(coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)))
+    shapes = [coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)]
+    kept = hypotheses(*shapes)
     margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
     return Proposal(kept, margin, len(given))
 
@@ -92,7 +95,7 @@ def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:
         found = mended(found, one)
     kept: list[Hypothesis] = []
     for hypothesis in sorted(map(_hypothesis, found), key=lambda h: h.score):
-        if len(kept) < _KEPT and all(_apart(hypothesis, other) > _DIFFERENT for other in kept):
+        if len(kept) < _KEPT and all(_differ(hypothesis, other) for other in kept):
             kept.append(hypothesis)
     return kept
 
@@ -139,8 +142,11 @@ def _away(candidate: Candidate, pairs: np.ndarray) -> np.ndarray:
     return pairs[keep]
 
 
-def _apart(first: Hypothesis, second: Hypothesis) -> float:
-    """Mean distance of the images of samples under two maps."""
-    shape = first.candidate.source.shape
+def _differ(first: Hypothesis, second: Hypothesis) -> bool:
+    """Whether two maps of the same shapes are different hypotheses."""
+    shape, target = first.candidate.source.shape, first.candidate.target.shape
     a, b = (h.candidate.images(shape.samples) for h in (first, second))
-    return float(first.candidate.target.shape.distance[a, b].mean())
+    if float(target.distance[a, b].mean()) > _DIFFERENT:
+        return True
+    ours, theirs = (dict(_tips_brought_together(h.candidate).tolist()) for h in (first, second))
+    return any(ours[v] != theirs[v] for v in ours.keys() & theirs.keys())

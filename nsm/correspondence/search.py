@@ -15,7 +15,7 @@ from itertools import permutations
 import numpy as np
 import torch
 
-from nsm.correspondence.coarse_shape import CoarseShape
+from nsm.correspondence.coarse_shape import COMMON, CoarseShape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
 from nsm.correspondence.refinement import Anchors, Batch, Sines, refined
 from nsm.domains.orbifold import group
@@ -42,6 +42,7 @@ class Round:
 
 
 ROUNDS = (Round(400, 3, 12), Round(80, 5, 25), Round(16, 8, 40))
+_THROUGH = Round(8, 8, 60)  # given landmarks, of five or more
 
 
 @dataclass(frozen=True)
@@ -98,12 +99,17 @@ def candidates(
     """Maps of the source to the target that may be right, least distorted first.
 
     Landmarks that are given on both shapes are held: a map does not take one to another tip, and
-    what it misses them by is added to its energy.
+    what it misses them by is added to its energy. Of five or more, four are the cones.
 
     Raises:
-        NsmError: ``no_proposal``: no map meets the landmarks that are given.
+        NsmError: ``no_proposal``: no map meets the landmarks that are given; ``not_injective``:
+            of five or more, all fours are too close to each other.
     """
     at("layouts")
+    if source.given >= COMMON:
+        found = through_four(source, target, np.arange(source.given))
+        drawn = [fixed_pairs(found[0])] * len(found)
+        return sorted(trained(found, _THROUGH, drawn=drawn), key=lambda c: c.cost)
     sets, scores = quick_scores(source)
     ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]])
     theirs = _laid_out(target, _similar_sets(ours, target))
@@ -125,6 +131,37 @@ def candidates(
         at("maps tried", k, len(rounds))
         found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held)
     return sorted(found, key=lambda c: c.cost)
+
+
+def through_four(
+    source: CoarseShape, target: CoarseShape, corresponding: np.ndarray
+) -> list[Candidate]:
+    """The affine maps that take four corresponding tips to each other, one for each isotopy class.
+
+    Args:
+        source, target: the shapes.
+        corresponding: numbers (K,) of tips that correspond. The four are those of which both
+            shapes' layouts are distorted least.
+
+    Raises:
+        NsmError: ``not_injective``: these four are too close to each other.
+    """
+    sets, first = quick_scores(source, corresponding)
+    four = sets[int((first + quick_scores(target, corresponding)[1]).argmin())]
+    a, b = layout(source, four), layout(target, four)
+    if a is None or b is None:
+        raise NsmError(
+            "the landmarks lie too close to each other for a coarse map",
+            kind="not_injective",
+            key="landmarks",
+        )
+    looked_up, nothing = table(b), np.zeros((0, 2))
+    found = [
+        Candidate(a, b, looked_up, matrix, shift, 0, nothing, 0.0)
+        for matrix, shift in affine_maps(a, b)
+    ]
+    wanted = np.stack([source.tips[four], target.tips[four]], axis=1)
+    return [c for c in found if np.array_equal(c.cones(), wanted)]
 
 
 def fixed_pairs(candidate: Candidate) -> np.ndarray:

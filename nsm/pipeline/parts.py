@@ -12,13 +12,14 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.distances import edge_distances
 from nsm.domains import Domain
 from nsm.domains.automatic import is_part_of_whole
 from nsm.domains.joint_preparation import Mesh
+from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface
 from nsm.pipeline.resolve_inputs import Shape
-from nsm.surfaces.topology import face_areas, genus_and_boundary
+from nsm.surfaces.topology import boundary_loops, face_areas, genus_and_boundary
 from nsm.surfaces.validation import Repairs
 
 _NEAREST = 3  # landmarks to which distances are compared: long ways may lead around what is missing
@@ -46,14 +47,35 @@ def closed_parts(
 
     Returns:
         source and target.
+
+    Raises:
+        NsmError: ``too_few_landmarks``: a part without any; ``wrong_topology``: a part and a target
+            in closed form.
     """
     # the cones of both are chosen together: what was laid out alone is laid out again
     part, whole = (_mesh(shape) for shape in shapes)
-    if domain.has_boundary or part is None or whole is None:
+    if domain.has_boundary or part is None:
         return list(shapes)
-    mesh, other = part.cleaned(repairs), whole.cleaned(repairs)
+    mesh = part.cleaned(repairs)
+    if whole is None:
+        if boundary_loops(mesh.faces) and _is_analytic(shapes[1]):
+            raise NsmError(
+                f"{part.name} is open: a part is mapped into a closed mesh, not into a surface in "
+                "closed form; give a mesh as the target",
+                kind="wrong_topology",
+                key="target",
+            )
+        return list(shapes)
+    other = whole.cleaned(repairs)
     if not is_part_of_whole([genus_and_boundary(m.faces) for m in (mesh, other)]):
         return list(shapes)
+    if not len(landmarks[0]):
+        raise NsmError(
+            f"{part.name} is open, {whole.name} is closed: without landmarks nothing says where "
+            f"the part belongs; give {_CONES} landmarks or more that are on the part",
+            kind="too_few_landmarks",
+            key="landmarks",
+        )
     points, faces = other.vertices, other.faces
     marks = np.stack([mesh.merged[landmarks[0]], other.merged[landmarks[1]]])
     scale, why = 1.0, "that of the files, for lack of landmarks"
@@ -82,9 +104,13 @@ def _mesh(shape: Shape) -> Mesh | None:
     """The mesh of a shape; None for an analytic one, and for one whose mesh is not known."""
     if isinstance(shape, Mesh):
         return shape
-    if isinstance(shape.map, AnalyticSurface) or shape.surface.raw is None:
+    if _is_analytic(shape) or shape.surface.raw is None:
         return None
     return Mesh(shape.surface.name, *shape.surface.raw)
+
+
+def _is_analytic(shape: Shape) -> bool:
+    return not isinstance(shape, Mesh) and isinstance(shape.map, AnalyticSurface)
 
 
 def relative_scale(

@@ -25,7 +25,8 @@ from nsm.surfaces.topology import boundary_loops
 from nsm.surfaces.validation import CleanMesh
 
 AUTO = "auto"
-_COMPLETED = 4  # landmarks at most that are completed by others
+_ENOUGH = 4  # landmarks for common cones, completed only by sure ones
+_COMPLETED = 8  # landmarks at most that are completed by others
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,11 @@ class ProposedLandmarks:
         """The landmarks (L,) that are taken, of each surface."""
         return list(self.vertices[self.chosen].T)
 
+    @property
+    def added(self) -> int:
+        """How many landmarks are taken beside those given."""
+        return len(self.vertices[self.chosen]) - self.given
+
     def to_json(self) -> str:
         """The landmarks as a file that can be corrected and given back, with the alternatives."""
         others = [
@@ -83,7 +89,6 @@ class ProposedLandmarks:
     @property
     def said(self) -> str:
         """What was given, what is proposed, and how sure that is."""
-        count = len(self.vertices[self.chosen]) - self.given
         kept = f"{self.given} given are kept, " if self.given else ""
         ahead = (
             f"{self.margin:.3f} ahead of the next different map, in log energy"
@@ -91,7 +96,7 @@ class ProposedLandmarks:
             else "no different map among the best"
         )
         sure = "sure" if self.sure else "NOT SURE"
-        return f"landmarks: {kept}{count} proposed, {sure}: {ahead}"
+        return f"landmarks: {kept}{self.added} proposed, {sure}: {ahead}"
 
 
 def given_or_proposed(
@@ -106,7 +111,7 @@ def given_or_proposed(
     """The landmarks of a map: those given, those proposed, or both.
 
     Landmarks are proposed if they are ``auto``; and on the orbifold for meshes if none are given,
-    or one to four, which are completed. Four are enough for common cones: unsure ones do not come
+    or one to eight, which are completed. Four are enough for common cones: unsure ones do not come
     to them.
 
     Args:
@@ -169,13 +174,16 @@ def given_or_proposed(
         try:
             found = _proposal(cleaned, ids, settings.alternative)
         except NsmError as error:
-            if asked or settings.strict or error.key == "proposal.alternative":
+            needed = settings.strict and len(ids[0]) < _ENOUGH
+            if asked or needed or error.key == "proposal.alternative":
                 raise
             console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
             return list(shapes), ids, None
-    if len(ids[0]) == _COMPLETED and not found.sure and not settings.alternative:
-        console.print(f"{found.said}; only those given are taken", soft_wrap=True)
-        return list(shapes), ids, None
+    if len(ids[0]) >= _ENOUGH and not settings.alternative:
+        if not found.sure:
+            console.print(f"{found.said}; only those given are taken", soft_wrap=True)
+        if not (found.sure and found.added):
+            return list(shapes), ids, None
     if settings.strict and not found.sure:
         raise NsmError(
             f"{found.said}; give landmarks, or leave proposal.strict out",

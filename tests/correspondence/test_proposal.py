@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from limbs import LIMBS, star
 
 from nsm.correspondence import proposal, proposed, proposed_for_all, search
 from nsm.correspondence.coarse_shape import coarse_shape
@@ -15,26 +16,6 @@ from nsm.domains.orbifold import group
 from nsm.domains.orbifold.cover import lifted_near, located
 from nsm.errors import NsmError
 from nsm.surfaces.shapes import hemisphere, torus
-
-# directions of limbs, and their lengths: no symmetry takes them to one another
-LIMBS = {
-    (1.0, 0.0, 0.2): 2.6,
-    (-0.3, 1.0, 0.0): 1.9,
-    (-0.8, -0.7, 0.1): 1.3,
-    (0.1, -0.2, 1.0): 1.6,
-    (0.3, -0.9, -0.6): 2.2,
-}
-
-
-def star(lengths, width=0.35):
-    """A ball with limbs, as vertices and faces, and the vertices at the limbs' tips."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    points = np.array(ball.vertices)
-    along = np.array(list(LIMBS)) / np.linalg.norm(list(LIMBS), axis=1)[:, None]
-    angle = np.arccos(np.clip(points @ along.T, -1, 1))
-    radius = 1 + np.exp(-((angle / width) ** 2)) @ np.array(lengths)
-    return radius[:, None] * points, np.array(ball.faces), angle.argmin(axis=0)
-
 
 CORNERS = [(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)]
 
@@ -88,11 +69,18 @@ def test_a_turned_and_stretched_shape_is_recognised(pair, quick):
     assert best.candidate.energy < 5 and best.score < np.log(5) + 0.4
 
 
-def test_nothing_is_sure_where_all_is_alike(quick):
-    """Twelve rotations are equally good."""
-    found = proposed(tetrapod(), tetrapod())
-    assert not found.sure
-    assert len(found.hypotheses) > 1
+def test_nothing_is_sure_where_all_is_alike(quick, monkeypatch):
+    """Twelve rotations are equally good: far from each other, and with other limbs exchanged."""
+    shape = coarse_shape(*tetrapod())
+    found = proposal.candidates(shape, shape)
+    monkeypatch.setattr(proposal, "candidates", lambda *_: found)
+    for apart in (0.2, np.inf):  # in the mean; at last the limbs alone tell maps from each other
+        monkeypatch.setattr(proposal, "_DIFFERENT", apart)
+        every = proposed(tetrapod(), tetrapod())
+        assert not every.sure
+        assert len(every.hypotheses) > 1
+    ends = [tuple(sorted(h.vertices.tolist())) for h in every.hypotheses]
+    assert len(set(map(str, ends))) == len(ends)
 
 
 @pytest.mark.parametrize("mesh", [torus(), hemisphere()])
@@ -197,6 +185,27 @@ def test_given_landmarks_are_kept_and_decide_between_symmetric_maps(quick):
     # the half-turn that exchanges the first two exchanges the others
     assert dict(limb.tolist()) == {0: 1, 1: 0, 2: 3, 3: 2}
     assert missed(found.hypotheses[0].candidate).mean() < 0.05
+
+
+def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch):
+    """Three limbs have landmarks; two landmarks lie between limbs; two limbs are left."""
+    monkeypatch.setattr(proposal, "MENDING", (Round(4, 8, 30),))
+    monkeypatch.setattr(search, "_THROUGH", Round(8, 5, 60))
+    source, target, tips = pair
+    between = np.abs(np.linalg.norm(source[0], axis=1) - 1).argsort()[[0, 40]]
+    ours = np.concatenate([tips[0][:3], between])
+    corner = [np.flatnonzero(source[1] == v)[0] for v in ours]  # the same in both lists of faces
+    given = np.stack([ours, target[1].ravel()[corner]], axis=1)
+    found = proposed(source, target, given)
+    best = found.hypotheses[0].vertices
+    assert found.sure and best[:5].tolist() == given.tolist()
+    left = set()
+    for p, q in best[5:]:
+        limb = np.linalg.norm(source[0][tips[0]] - source[0][p], axis=1)
+        its = np.linalg.norm(target[0][tips[1]] - target[0][q], axis=1)
+        assert limb.argmin() == its.argmin()
+        left.add(int(limb.argmin()))
+    assert left == {3, 4}
 
 
 def test_a_collection_is_matched_with_one_hub(pair, quick):

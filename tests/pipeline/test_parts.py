@@ -11,7 +11,7 @@ import trimesh
 from domains.orbifold.shapes import limbs
 
 import nsm
-from nsm.correspondence.coarse_shape import edge_distances
+from nsm.correspondence.distances import edge_distances
 from nsm.errors import NsmError
 from nsm.pipeline.parts import relative_scale
 from nsm.results.textures import GREY
@@ -181,8 +181,18 @@ def test_a_whole_shape_is_not_mapped_into_a_part():
         assert refused.value.kind == "wrong_topology"
 
 
-def test_no_landmarks_are_proposed_for_a_part():
+@pytest.mark.parametrize(
+    "landmarks, kind",
+    [("auto", "wrong_topology"), (None, "too_few_landmarks"), ([], "too_few_landmarks")],
+)
+def test_a_part_needs_landmarks(landmarks, kind):
     whole, piece, _, _ = cut()
     with pytest.raises(NsmError) as refused:
-        nsm.map_pair(piece, whole, "auto", overrides=FAST, progress=False)
-    assert (refused.value.kind, refused.value.key) == ("wrong_topology", "landmarks")
+        nsm.map_pair(piece, whole, landmarks, overrides=FAST, progress=False)
+    assert (refused.value.kind, refused.value.key) == (kind, "landmarks")
+
+
+def test_a_part_is_not_mapped_into_a_closed_surface_in_closed_form():
+    with pytest.raises(NsmError) as refused:
+        nsm.map_pair(cut()[1], {"name": "ellipsoid"}, overrides=FAST, progress=False)
+    assert (refused.value.kind, refused.value.key) == ("wrong_topology", "target")

@@ -103,8 +103,8 @@ def test_closed_meshes_without_landmarks_have_some_proposed(monkeypatch):
     assert take(None, shapes=[meshes()[0], results(2).neural[0]])[1] is None
 
 
-@pytest.mark.parametrize("count", [1, 3, 4])
-def test_one_to_four_given_landmarks_are_kept_and_completed(count, monkeypatch):
+@pytest.mark.parametrize("count", [1, 4, 8])
+def test_one_to_eight_given_landmarks_are_kept_and_completed(count, monkeypatch):
     answers(monkeypatch, 0.5)
     pairs = [[100 + k, 201 + k] for k in range(count)]
     ids, found, said = take(pairs)
@@ -124,7 +124,22 @@ def test_unsure_ones_complete_fewer_than_four_only(monkeypatch):
     ids, _, said = take(pairs[:3])
     assert len(ids[0]) == 7 and "WARNING" in said
     assert len(take(pairs, "proposal.alternative=1")[0][0]) == 8  # who asks for it has it
-    assert len(take([*pairs, [300, 300]])[0][0]) == 5  # five are complete
+
+
+def test_nine_given_landmarks_are_complete(monkeypatch):
+    answers(monkeypatch, 0.5)
+    pairs = [[100 + k, 201 + k] for k in range(9)]
+    ids, found, said = take(pairs)
+    assert (len(ids[0]), found, said.strip()) == (9, None, "")
+
+
+def test_nothing_is_said_where_nothing_is_left_to_complete(monkeypatch):
+    def all_given(source, target, given):
+        return Proposal([Hypothesis(given, 2.0, True, None)], np.inf)
+
+    monkeypatch.setattr(proposed_landmarks, "proposed", all_given)
+    ids, found, said = take([[100 + k, 201 + k] for k in range(5)])
+    assert (len(ids[0]), found, "proposed" in said) == (5, None, False)
 
 
 PLACES = [[[0, 0.2, 0.3, 0.5], [7, 0.5, 0.5, 0.0]], [[4, 0.1, 0.1, 0.8], [9, 0.0, 1.0, 0.0]]]
