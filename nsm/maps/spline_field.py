@@ -16,6 +16,7 @@ from nsm.maps.encodings import _bspline, transformed
 _DEGREE = 2
 _TAPS = (_DEGREE + 1) ** 2
 _KEPT = 8  # sets of points whose weights are kept
+_FEW = 4096
 _MOST = 1 << 17  # larger sets are not kept
 
 
@@ -65,8 +66,8 @@ def _sums(table: Tensor, rows: Tensor, weights: Tensor, starts: Tensor | None = 
 class SplineField(nn.Module):
     """One uniform quadratic B-spline on [-1, 1]²: linear in its coefficients, zero at the start.
 
-    Weights of points that come again, as those of a fixed quadrature do, are kept from the second
-    time on: to order them for the gradient takes longer than a single product.
+    Weights of large sets of points, as those of a fixed quadrature, which come again, are kept,
+    ordered for the gradient. Small ones are batches of other points each time.
 
     Args:
         out_dim: of the values.
@@ -95,7 +96,6 @@ class SplineField(nn.Module):
         rows = self.side**2 // (2 if odd else 1)
         self.coefficients = nn.Parameter(torch.zeros(rows, out_dim))
         self._recent: list[_Weights] = []
-        self._once: list[tuple[Tensor, int]] = []
         self._watched: list[tuple[Tensor, Tensor]] | None = None
 
     @property
@@ -115,7 +115,7 @@ class SplineField(nn.Module):
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_recent": [], "_once": []}
+        return {**self.__dict__, "_recent": []}
 
     def seen(self, x: Tensor, tangents: bool) -> tuple[Tensor, Tensor]:
         """What points (N, 2) see of the coefficients.
@@ -169,33 +169,24 @@ class SplineField(nn.Module):
         elif points.requires_grad or transformed() or torch.compiler.is_compiling():
             rows, weights = self.seen(points, tangents)
             out = (weights[..., None] * self.coefficients[rows]).sum(dim=-2)
-        elif (
-            torch.is_grad_enabled()
-            and self.coefficients.requires_grad
-            and (kept := self._weights(points, tangents)) is not None
-        ):
-            out = _Product.apply(self.coefficients, kept)
+        elif len(points) > _FEW and torch.is_grad_enabled() and self.coefficients.requires_grad:
+            out = _Product.apply(self.coefficients, self._weights(points, tangents))
         else:
             rows, weights = self.seen(points, tangents)
             out = _sums(self.coefficients, rows.repeat(planes, 1), weights.flatten(0, 1))
         return out.view(planes, *x.shape[:-1], self.out_dim)
 
-    def _weights(self, x: Tensor, tangents: bool) -> _Weights | None:
-        """The weights of points (N, 2) that come again; None the first time."""
+    def _weights(self, x: Tensor, tangents: bool) -> _Weights:
+        """The weights of points (N, 2), kept if they were asked for before."""
         planes = 3 if tangents else 1
         for at, known in enumerate(self._recent):
             if known.planes == planes and known.x.device == x.device and torch.equal(known.x, x):
                 self._recent.append(self._recent.pop(at))
                 return known
-        for at, (seen, count) in enumerate(self._once):
-            if count == planes and seen.device == x.device and torch.equal(seen, x):
-                self._once.pop(at)
-                made = _Weights(seen, *self.seen(x, tangents), len(self.coefficients))
-                self._recent = [*self._recent[1 - _KEPT :], made]
-                return made
+        made = _Weights(x.clone(), *self.seen(x, tangents), len(self.coefficients))
         if len(x) <= _MOST:
-            self._once = [*self._once[1 - _KEPT :], (x.clone(), planes)]
-        return None
+            self._recent = [*self._recent[1 - _KEPT :], made]
+        return made
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (..., 2) to values (..., out_dim)."""

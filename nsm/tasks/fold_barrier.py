@@ -109,7 +109,8 @@ class Folds:
 
     The smooth one takes the determinant relative to what it was at the beginning of the step, and
     begins before h folds, so that a line search is not stopped by a single point: a step may take a
-    determinant to a third for nothing. Where it was negative, the term pushes it out.
+    determinant to a third for nothing. Where it was negative, or far below the median, the
+    term pushes it up.
 
     Args:
         kind: exponential, or smooth.

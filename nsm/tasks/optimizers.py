@@ -149,7 +149,7 @@ def _quasi_newton(module: nn.Module, settings: Mapping[str, Any], max_steps: int
     if len(fields) != len(trained):
         raise NsmError(
             "setting optimizer: quasi-Newton steps train splines alone; take map=spline, or "
-            "optimizer=adam_planar for networks",
+            "experiment=adam with a network",
             kind="unsuitable_network",
             key="optimizer",
         )
