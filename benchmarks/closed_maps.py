@@ -211,22 +211,29 @@ def tables() -> str:
         for domain in ("disc", found["closed_domain"]):
             for way, of in sorted(found[domain].items(), key=lambda one: list(WAYS).index(one[0])):
                 row = [f"{of[key]:.2f}" if key in of else "–" for key in COLUMNS]
-                name = found["case"] if (domain, way) == ("disc", "default") else ""
-                rows.append([name, domain, way, *row, "yes" if of["certified"] else "no"])
-    shown = table(["map", "domain", "training", *COLUMNS.values(), "certified"], rows)
+                name = "" if rows and rows[-1][-1] == found["case"] else found["case"]
+                rows.append(
+                    [name, domain, way, *row, "yes" if of["certified"] else "no", found["case"]]
+                )
+    shown = table(
+        ["map", "domain", "training", *COLUMNS.values(), "certified"], [row[:-1] for row in rows]
+    )
     pairs = [found for found in results if found["case"] != "collection"]
     groups = {"all": pairs, "genus 0": [p for p in pairs if p["closed_domain"] == "orbifold"]}
     compared = {
-        "Closed domain over disc": (("closed", "default"), ("disc", "default")),
-        "Fast over default, closed domains": (("closed", "fast"), ("closed", "default")),
-        "Fast over default, disc": (("disc", "fast"), ("disc", "default")),
+        "Closed domain over disc, Adam": (("closed", "adam"), ("disc", "adam")),
         "Default over Adam, closed domains": (("closed", "default"), ("closed", "adam")),
+        "Fast over Adam, closed domains": (("closed", "fast"), ("closed", "adam")),
+        "Closed domain over disc": (("closed", "default"), ("disc", "default")),
         "Default over Adam, disc": (("disc", "default"), ("disc", "adam")),
+        "Fast over Adam, disc": (("disc", "fast"), ("disc", "adam")),
     }
     ratios = []
     for label, ends in compared.items():
         for what, chosen in groups.items():
             both = [[_figures_of(found, *end) for end in ends] for found in chosen]
+            if not all(all(pair) for pair in both):  # not measured yet
+                continue
             means = [f"{mean(one[key] / other[key] for one, other in both):.3f}" for key in RATIOS]
             ratios.append([f"{label}, {len(both)} pairs ({what})", *means])
     heads = ["mean of the ratios", *(COLUMNS[key] for key in RATIOS)]
@@ -234,7 +241,8 @@ def tables() -> str:
 
 
 def _figures_of(found: dict[str, Any], domain: str, way: str) -> dict[str, Any]:
-    figures: dict[str, Any] = found[found["closed_domain"] if domain == "closed" else domain][way]
+    on = found[found["closed_domain"] if domain == "closed" else domain]
+    figures: dict[str, Any] = on.get(way, {})
     return figures
 
 

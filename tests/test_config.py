@@ -48,6 +48,10 @@ TASKS = {
     ("experiment", "preview"): "pair_map",
     ("published", "param"): "param",
     ("published", "pair_map"): "pair_map",
+    ("constraints", "pair_newton"): "pair_map",
+    ("loss_weights", "pair_newton"): "pair_map",
+    ("optimizer", "adam_newton"): "pair_map",
+    ("experiment", "adam"): "pair_map",
     ("published", "collection_map"): "collection_map",
     ("data", "collection"): "collection_map",
 }
@@ -88,6 +92,8 @@ def mine(monkeypatch):
 def test_every_option_composes_and_is_made(group, name):
     task = TASKS.get((group, name), "param" if group == "energy" else "overfit")
     overrides = [f"{group}={name}"] if group == "task" else [f"task={task}", f"{group}={name}"]
+    if group == "published":  # which experiment=paper chooses
+        overrides = [f"task={task}", "experiment=paper"]
     if group == "constraints" and name.startswith("fast_"):  # weights are chosen beside them
         overrides.append(f"loss_weights={name}")
     config = compose_config(overrides)  # which makes network, optimizer, scheduler and more
@@ -182,7 +188,7 @@ def test_groups_can_be_changed_separately():
         (["experiment=paper"], "none", 50_000),
         (["sweep=activation"], "none", 8000),
         (["task=param"], "none", 2000),
-        (["task=pair_map", "encoding=fourier"], "none", 1500),
+        (["task=pair_map", "experiment=adam", "encoding=fourier"], "none", 1500),
     ],
 )
 def test_only_a_grid_and_a_surface_can_be_fitted(overrides, linear_skip, steps):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -151,8 +150,7 @@ class ConstrainedMap(Training):
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
         if self.quadrature is not None:
-            self.triangles_from, weights = NEWTON_FROM * steps, self.loss_weights
-            self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
+            self.triangles_from = NEWTON_FROM * steps
         further_training(self, steps)
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:

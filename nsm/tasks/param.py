@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -137,8 +136,7 @@ class Param(OneMeshMap):
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
         self.loss_weights = stronger(self.loss_weights)
         if self.quadrature is not None:
-            self.triangles_from, weights = NEWTON_FROM * steps, self.loss_weights
-            self.loss_weights = replace(weights, injectivity=10 * weights.injectivity)
+            self.triangles_from = NEWTON_FROM * steps
         further_training(self, steps)
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:

@@ -28,7 +28,8 @@ def run(task, folder, resuming=False):
         "overfit": Given(surface=neural[0].surface),
         "pair_map": Given(source=neural[0], target=neural[1], landmarks=[(0, 0), (9, 8)]),
     }[task]
-    config = compose_config([f"task={task}", *WORDS])
+    more = ["experiment=adam"] if task == "pair_map" else []
+    config = compose_config([f"task={task}", *more, *WORDS])
     return run_task(config, folder, given, resuming=resuming)
 
 

@@ -244,7 +244,9 @@ def test_killed_while_saving_it_ends_at_the_same_weights(surface, tmp_path, whol
 
 MAP_WORDS = ["data.batch_size=64", "data.held_out=64", "data.steps_per_epoch=4", "logger=none"]
 MAP_WORDS += ["trainer.max_steps=20", "trainer.threads=1", "trainer.progress=false"]
-MAP_WORDS += ["artefacts=false", "map.width=8", "map.depth=1"]
+MAP_WORDS += ["artefacts=false"]
+NETWORK = ["map.width=8", "map.depth=1"]
+SPLINE = ["map.cells=8", "constraints.triangles_from=0.8"]  # ends in quasi-Newton steps
 
 
 def mapped(task, folder, resuming=False):
@@ -252,9 +254,13 @@ def mapped(task, folder, resuming=False):
     phi, psi, _ = neural = tiny_surfaces()
     if task == "closed":
         phi, psi = tiny_rings()
-        config = compose_config(["task=pair_map", *MAP_WORDS, "encoding.resolutions=[8]"])
+        config = compose_config(
+            ["task=pair_map", "experiment=adam", *MAP_WORDS, *NETWORK, "encoding.resolutions=[8]"]
+        )
     else:
-        config = compose_config([f"task={task}", *MAP_WORDS])
+        config = compose_config(
+            [f"task={task}", *MAP_WORDS, *(SPLINE if task == "pair_map" else NETWORK)]
+        )
     if task == "param":
         result = run_task(config, folder, Given(phi=phi), resuming=resuming)
         return {**result.map.state_dict(), "uv": torch.from_numpy(result.uv)}

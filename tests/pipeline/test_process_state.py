@@ -45,7 +45,7 @@ def overfit(neural, folder):
 
 
 def pair(neural, folder):
-    words = [*TINY, "trainer.precision=bf16"]
+    words = [*TINY, "trainer.precision=bf16", "experiment=adam"]
     return nsm.map_pair(*neural[:2], overrides=words, folder=folder, progress=False)
 
 
