@@ -403,7 +403,8 @@ class ParamConstraints(Checked):
             so that the map is bijective.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
-            areas at samples that are near to it, for quasi-Newton steps.
+            det J_h where a step takes it below a third, for quasi-Newton steps. At triangles it is
+            smooth.
         triangles_from: share of the steps after which the training measures distortion at triangles
             of the source's mesh, as figures do, instead of samples.
     """
@@ -422,7 +423,7 @@ class PairConstraints(Checked):
         boundary: exact: h keeps to the domain by construction; penalty: λ_B pulls the image of
             the boundary to ∂Ω.
         landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
-        multiplier_every: steps between two updates of the multipliers.
+        multiplier_every: steps between two updates of the multipliers; at triangles, each step.
         ramp: share of the steps over which landmarks and the seam come into full effect.
         ramp_of: what the ramp moves of the landmarks: targets, from where h has them at its start;
             or weights: λ_C grows from a thousandth.
@@ -430,7 +431,8 @@ class PairConstraints(Checked):
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         multipliers_from: share of the steps before the multipliers' first update.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
-            areas at samples that are near to it, for quasi-Newton steps.
+            det J_h where a step takes it below a third, for quasi-Newton steps. At triangles it is
+            smooth.
         triangles_from: share of the steps after which the training measures distortion at triangles
             of the source's mesh, as figures do, instead of samples.
     """
@@ -463,7 +465,7 @@ class CollectionConstraints(PairConstraints):
         ramp_of: what the ramp moves of the landmarks: targets, from where h_i has them at its
             start; or weights: λ_C grows from a thousandth.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
-            det J_h at samples that are near to it, for quasi-Newton steps.
+            det J_h where a step takes it below a third, for quasi-Newton steps.
         triangles_from: of task=pair_map alone.
         pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
             mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.

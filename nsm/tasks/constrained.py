@@ -32,10 +32,9 @@ class ConstrainedMap(Training):
     ``constraints.landmarks=augmented``, multipliers are updated every ``multiplier_every`` steps
     (at triangles, each step) once the ramp is over (augmented Lagrangian), so that landmarks are
     met whatever λ_C is; with ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the
-    landmarks' targets move
-    from where h has them at its start to their places (``constraints.ramp_of=targets``) or λ_C
-    grows from a thousandth (``weights``), and the seam's weight grows from zero: with the full
-    terms at once, h would fold.
+    landmarks' targets move from where h has them at its start to their places
+    (``constraints.ramp_of=targets``) or λ_C grows from a thousandth (``weights``), and the seam's
+    weight grows from zero: with the full terms at once, h would fold.
 
     Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
     ``landmark_error``.
@@ -138,7 +137,7 @@ class ConstrainedMap(Training):
             return
         # at triangles a step is far longer, and nearer to the minimum
         every = 1 if self.global_step > self.triangles_from else held.multiplier_every
-        weight = self.landmark_weight  # of the step that has been made
+        weight = self.landmark_weight  # that of the next step
         if self.global_step % every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
