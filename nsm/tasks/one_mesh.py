@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 
 from nsm.data import Samples
 from nsm.energies import At
+from nsm.tasks.curvature import positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier, Folds
 from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
 from nsm.tasks.terms import Distortion, Evaluation
@@ -26,14 +28,14 @@ class Places(NamedTuple):
         at: where they lie.
         share: (N,) of the area.
         told: (N,) 1 where a fold counts, 0 where single precision does not tell.
-        excess: (N,) of the determinant over that of J_h at the point.
+        determinant: (N,) of triangles under h relative to their own; None: that of J_h.
     """
 
     uv: Tensor
     at: At
     share: Tensor
     told: Tensor
-    excess: Tensor
+    determinant: Tensor | None
 
 
 class OneMeshMap(Training):
@@ -73,13 +75,39 @@ class OneMeshMap(Training):
         """Where a step measures: at samples, or at triangles, for which their centres stand."""
         if (some := self._triangles(batch)) is None:
             one = batch.uv.new_ones(len(batch.uv))
-            return Places(batch.uv, At(batch.uv, batch.points), one / len(one), one, 0 * one)
-        centres = some.centres
+            return Places(batch.uv, At(batch.uv, batch.points), one / len(one), one, None)
         with torch.no_grad():
-            true = some.sides(self.map(some.uv)).det() / some.determinant
-            there = torch.linalg.det(self.map.value_and_jacobian(centres)[1])
+            determinant = some.sides(self.map(some.uv)).det() / some.determinant
         told = some.oriented / some.share.clamp(min=1e-30)
-        return Places(centres, some.at, some.share, told, true - there)
+        return Places(some.centres, some.at, some.share, told, determinant)
+
+    def _hessians(
+        self,
+        places: Places,
+        source: Tensor,
+        jacobian: Tensor,
+        metric: Callable[[Tensor], Tensor],
+        folding: float,
+    ) -> Tensor:
+        """Second derivatives (N, 4, 4) of distortion and folds by J_h at places, by their shares.
+
+        Args:
+            places: N of them.
+            source: A (N, 2, 2).
+            jacobian: J_h (N, 2, 2).
+            metric: from J_h to B, each (N, 2, 2).
+            folding: λ_inv.
+        """
+        excess: Tensor | float = 0.0  # of a triangle's determinant, where it is not that of J_h
+        if places.determinant is not None:
+            excess = places.determinant - torch.linalg.det(jacobian)
+
+        def loss(j: Tensor) -> Tensor:
+            values = self.energy.total(self.energy.parts(source, metric(j), places.at))
+            det = torch.linalg.det(j) + excess
+            return values + folding * places.told * self.folds(det, self.global_step, smooth=True)
+
+        return places.share.double()[:, None, None] * positive_hessians(loss, jacobian)
 
     def _on_triangles(
         self, some: Triangles, h: Tensor, sides: Tensor, image_metric: Tensor

@@ -12,7 +12,7 @@ from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.caps import Caps
 from nsm.tasks.constrained import ConstrainedMap
-from nsm.tasks.curvature import Curvature, positive_hessians
+from nsm.tasks.curvature import Curvature
 from nsm.tasks.fold_barrier import FoldBarrier, Folds
 from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
@@ -162,14 +162,10 @@ class PairMap(ConstrainedMap, OneMeshMap):
             source, _, jacobian, image = self._at(uv)
             outer = self.psi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
 
-        def energy(j: Tensor) -> Tensor:
-            target = first_fundamental_form(outer @ j)
-            values = self.energy.total(self.energy.parts(source, target, places.at))
-            det = torch.linalg.det(j) + places.excess
-            folds = self.folds(det, self.global_step, smooth=True)
-            return values + w.injectivity * places.told * folds
+        def metric(j: Tensor) -> Tensor:
+            return first_fundamental_form(outer @ j)
 
-        hessians = places.share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        hessians = self._hessians(places, source, jacobian, metric, w.injectivity)
         found = [Curvature(self.map, uv, hessians)]
         if self.caps is not None:
             step = self.global_step

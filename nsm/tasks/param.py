@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from nsm.data import Samples
 from nsm.energies import At, first_fundamental_form
 from nsm.settings import ParamConstraints, ParamWeights
-from nsm.tasks.curvature import Curvature, positive_hessians
+from nsm.tasks.curvature import Curvature
 from nsm.tasks.fold_barrier import NEWTON_FROM, FoldBarrier, Folds, further_training, stronger
 from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
@@ -117,19 +117,11 @@ class Param(OneMeshMap):
         return source, jacobian, h
 
     def curvatures(self) -> list[Curvature]:
-        w = self.loss_weights
-        places = self._places(self.batch)
+        places, folding = self._places(self.batch), self.loss_weights.injectivity
         with torch.no_grad():
             source, jacobian, _ = self._at(places.uv)
 
-        def energy(j: Tensor) -> Tensor:
-            target = first_fundamental_form(j)
-            values = self.energy.total(self.energy.parts(source, target, places.at))
-            det = torch.linalg.det(j) + places.excess
-            folds = self.folds(det, self.global_step, smooth=True)
-            return values + w.injectivity * places.told * folds
-
-        hessians = places.share.double()[:, None, None] * positive_hessians(energy, jacobian)
+        hessians = self._hessians(places, source, jacobian, first_fundamental_form, folding)
         return [Curvature(self.map, places.uv, hessians)]
 
     def strengthen(self, steps: int) -> None:
