@@ -399,8 +399,9 @@ class ParamConstraints(Checked):
     """How task=param constrains its map.
 
     Args:
-        boundary: free; or fixed: h keeps to the domain by construction and its boundary slides,
-            so that the map is bijective.
+        boundary: free; apart: free, but a barrier keeps its image from meeting itself, so that the
+            map is injective; or fixed: h keeps to the domain by construction and its boundary
+            slides, so that the map is bijective.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
             det J_h where a step takes it below a third, for quasi-Newton steps. At triangles it is
@@ -409,7 +410,7 @@ class ParamConstraints(Checked):
             of the source's mesh, as figures do, instead of samples.
     """
 
-    boundary: Literal["free", "fixed"]
+    boundary: Literal["free", "apart", "fixed"]
     fold_every: Count = 25
     injectivity: Literal["exponential", "smooth"] = "exponential"
     triangles_from: Share = 1.0

@@ -31,10 +31,12 @@ FILES = sorted(
 )
 # the task that an option is for, if it is not for all
 TASKS = {
-    ("loss_weights", "param"): "param",
-    ("loss_weights", "pair"): "pair_map",
-    ("constraints", "param"): "param",
-    ("constraints", "pair"): "pair_map",
+    ("loss_weights", "adam_param"): "param",
+    ("loss_weights", "adam_pair_map"): "pair_map",
+    ("loss_weights", "adam_collection_map"): "collection_map",
+    ("constraints", "adam_param"): "param",
+    ("constraints", "adam_pair_map"): "pair_map",
+    ("constraints", "adam_collection_map"): "collection_map",
     ("constraints", "fast_pair_map"): "pair_map",
     ("loss_weights", "fast_pair_map"): "pair_map",
     ("data", "levels_pair_map"): "pair_map",
@@ -167,10 +169,10 @@ def test_groups_can_be_changed_separately():
     )
     assert (config.data.points[0], config.sampler.pool) == (2048, 500_000)
     assert config.domain._target_ == "nsm.domains.Square"
-    config = compose_config(["task=pair_map", "constraints=fast_pair_map", "loss_weights=pair"])
+    config = compose_config(["task=pair_map", "constraints=fast_pair_map", "loss_weights=adam_pair_map"])
     assert (config.constraints.multiplier_every, config.loss_weights.seam) == (1, 1e3)
     config = compose_config(
-        ["task=pair_map", "experiment=paper", "constraints=fast_pair_map", "loss_weights=pair"]
+        ["task=pair_map", "experiment=paper", "constraints=fast_pair_map", "loss_weights=adam_pair_map"]
     )
     assert (config.constraints.multiplier_every, config.map.width) == (1, 128)
 
@@ -187,7 +189,7 @@ def test_groups_can_be_changed_separately():
         (["experiment=fit"], "fitted", 0),
         (["experiment=paper"], "none", 50_000),
         (["sweep=activation"], "none", 8000),
-        (["task=param"], "none", 2000),
+        (["task=param", "experiment=adam"], "none", 1500),
         (["task=pair_map", "experiment=adam", "encoding=fourier"], "none", 1500),
     ],
 )
@@ -265,13 +267,13 @@ def test_no_grid_hides_the_activation_in_its_sweep():
         ("scheduler=sgdr scheduler.period_factor=0.5", "out_of_range", "scheduler.period_factor"),
         ("scheduler.warmup=-1", "out_of_range", "scheduler.warmup"),
         ("loss_weights.normall=1", "unknown_setting", "loss_weights.normall"),
-        ("loss_weights=pair", "unknown_setting", "loss_weights.injectivity"),
-        ("constraints=pair", "unknown_setting", "constraints"),
+        ("loss_weights=adam_pair_map", "unknown_setting", "loss_weights.injectivity"),
+        ("constraints=adam_pair_map", "unknown_setting", "constraints"),
         ("task=param constraints.bondary=fixed", "unknown_setting", "constraints.bondary"),
         ("task=param constraints.boundary=fixd", "unknown_option", "constraints.boundary"),
         ("task=pair_map constraints.ramp=3", "out_of_range", "constraints.ramp"),
         ("task=pair_map constraints.multiplier_every=often", "wrong_type", None),
-        ("task=pair_map loss_weights=param", "missing_setting", "loss_weights.boundary"),
+        ("task=pair_map loss_weights=adam_param", "missing_setting", "loss_weights.boundary"),
         ("task=param energy=null", None, None),
         ("callbacks.mine.patience=3", "missing_setting", "callbacks.mine"),
         (

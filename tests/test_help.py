@@ -46,7 +46,7 @@ def test_the_values_are_those_of_the_run():
     ("arguments", "steps"),
     [
         ([], 250),
-        (["task=param"], 2000),
+        (["task=param"], 8),
         (["initialization=random"], 8000),
         (["trainer.max_steps=7"], 7),
     ],

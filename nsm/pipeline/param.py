@@ -99,7 +99,7 @@ class ParamTask(Task):
             torch.as_tensor(areas, dtype=torch.float32),
         )
         settings = self.map_settings()
-        if surface.given_uv is not None and settings["constraints"]["boundary"] == "free":
+        if surface.given_uv is not None and settings["constraints"]["boundary"] != "fixed":
             settings["start"] = fitted_to_layout(surface.given_uv, surface, seed=self.config.seed)
         return self.module(**settings, mesh=mesh, phi=self._for_training())
 

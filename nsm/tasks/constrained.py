@@ -10,10 +10,9 @@ from torch import Tensor
 
 from nsm.energies import inside, landmark
 from nsm.settings import PairConstraints, PairWeights
-from nsm.tasks.fold_barrier import NEWTON_FROM, further_training, stronger
-from nsm.tasks.mesh_quadrature import MeshQuadrature
+from nsm.tasks.at_triangles import AtTriangles
+from nsm.tasks.fold_barrier import further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
-from nsm.tasks.training import Training
 
 # float32 places a point of the boundary no better than this
 _ON_BOUNDARY = 1e-6
@@ -23,7 +22,7 @@ _FIRST = 1e-3
 _LAST = 10.0
 
 
-class ConstrainedMap(Training):
+class ConstrainedMap(AtTriangles):
     """Base of the tasks that map surfaces to surfaces.
 
     With ``constraints.boundary=exact``, or on a closed domain, h maps Ω to itself by construction;
@@ -59,8 +58,6 @@ class ConstrainedMap(Training):
     there: Tensor
     seam: Tensor
     boundary_samples: Tensor
-    quadrature: MeshQuadrature | None
-    triangles_from: float
     multipliers: Tensor
 
     def __init__(
@@ -148,8 +145,6 @@ class ConstrainedMap(Training):
         folding triangles is ten times as large and acts on more of them, in small steps."""
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
-        if self.quadrature is not None:
-            self.triangles_from = NEWTON_FROM * steps
         further_training(self, steps)
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
@@ -16,7 +15,7 @@ _COUNT = 256
 # triangles of a look; larger meshes are gone through in turn, or a step would cost by their size
 _LOOK = 16_384
 _SMALL = 0.3  # share of a determinant where the smooth term begins
-NEWTON_FROM = 0.9  # of a further training
+_NEWTON_FROM = 0.9  # of a further training
 _STEEP = 10.0  # its factor, at most, in medians
 
 
@@ -148,16 +147,20 @@ def stronger(weights: Weights) -> Weights:
     return replace(weights, triangles=triangles)  # type: ignore[type-var]
 
 
-def further_training(module: pl.LightningModule, steps: int) -> None:
+def further_training(module: Any, steps: int) -> None:
     """Prepare a further training at a tenth of the rates, with four times as many triangles seen.
-    Where quasi-Newton steps end a training, the last tenth are such, and bring landmarks back.
+    Where quasi-Newton steps end a training, the last tenth are such, and bring landmarks back;
+    these are at triangles where the training's were.
     """
     for part in module.modules():
         if isinstance(part, FoldBarrier):
             part.watch(4 * part.chosen.shape[-1])
     optimizer = module.hparams["optimizer"]
-    if "newton_from" in optimizer:
-        optimizer["newton_from"] = NEWTON_FROM
+    adam_first = "newton_from" in optimizer
+    if adam_first:
+        optimizer["newton_from"] = _NEWTON_FROM
+    if module.quadrature is not None:
+        module.triangles_from = _NEWTON_FROM * steps if adam_first else 0.0
     for rate in ("lr", "encoding_lr"):
         if optimizer.get(rate) is not None:
             optimizer[rate] *= 0.1

@@ -6,18 +6,15 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nsm.data import Samples
 from nsm.energies import At
+from nsm.tasks.at_triangles import AtTriangles
 from nsm.tasks.curvature import positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier, Folds
-from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
+from nsm.tasks.mesh_quadrature import Triangles
 from nsm.tasks.terms import Distortion, Evaluation
-from nsm.tasks.training import Training
-
-# of a large mesh's triangles, whatever the batch is: fewer would be overfitted
-_FEWEST = 24_576
 
 
 class Places(NamedTuple):
@@ -38,15 +35,12 @@ class Places(NamedTuple):
     determinant: Tensor | None
 
 
-class OneMeshMap(Training):
-    """Base of the tasks that map one mesh: distortion is measured at samples or, after a share of
-    the steps, at the mesh's triangles.
+class OneMeshMap(AtTriangles):
+    """Base of the tasks that map one mesh, whose triangles are where distortion may be measured.
 
     Attributes:
         energy: of the metrics A and B, a blend.
         folds: of det J_h.
-        quadrature: the triangles; None: samples throughout.
-        triangles_from: the step from which they count.
         fold_barrier: of the mesh's triangles.
     """
 
@@ -54,26 +48,10 @@ class OneMeshMap(Training):
 
     energy: Any
     folds: Folds
-    quadrature: MeshQuadrature | None
-    triangles_from: float
-
-    def _set_quadrature(
-        self, share: float, max_steps: int, uv: Tensor, faces: Tensor, surface: nn.Module
-    ) -> None:
-        """Measure at triangles after a share of the steps; with all of them, at samples alone."""
-        self.quadrature, self.triangles_from = None, share * max_steps
-        if share < 1:
-            self.quadrature = MeshQuadrature(uv, faces, surface)
-
-    def _triangles(self, batch: Samples) -> Triangles | None:
-        """Those at which the distortion of a training step is measured; None: it is at samples."""
-        if self.quadrature is None or self.global_step < self.triangles_from:
-            return None
-        return self.quadrature.take(max(len(batch.uv), _FEWEST))
 
     def _places(self, batch: Samples) -> Places:
         """Where a step measures: at samples, or at triangles, for which their centres stand."""
-        if (some := self._triangles(batch)) is None:
+        if (some := self.triangles(len(batch.uv))) is None:
             one = batch.uv.new_ones(len(batch.uv))
             return Places(batch.uv, At(batch.uv, batch.points), one / len(one), one, None)
         with torch.no_grad():

@@ -80,7 +80,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         self.fold_barrier = FoldBarrier(*mesh, margin=held.fold_margin, every=held.fold_every)
         uv, faces = mesh
         part = faces if caps is None else faces[~caps]
-        self._set_quadrature(held.triangles_from, max_steps, uv, part, self.phi)
+        self.set_quadrature(held.triangles_from, max_steps, uv, part, self.phi)
         self.caps = None if caps is None else Caps(uv, faces[caps], self.phi, held.injectivity)
         self.diagonal = diagonal
         self.set_landmarks(points, targets, self.map.before(points), seam)
@@ -129,7 +129,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
 
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples of the source, and what it is made from."""
-        if self.training and (some := self._triangles(batch)) is not None:
+        if self.training and (some := self.triangles(len(batch.uv))) is not None:
             h = self.map(some.uv)
             B = first_fundamental_form(some.sides(self.psi(h)))
             return self._on_triangles(some, h, some.sides(h), B)

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 from nsm.data import Samples
 from nsm.energies import At, first_fundamental_form
 from nsm.settings import ParamConstraints, ParamWeights
+from nsm.tasks.boundary_barrier import BoundaryBarrier
 from nsm.tasks.curvature import Curvature
-from nsm.tasks.fold_barrier import NEWTON_FROM, FoldBarrier, Folds, further_training, stronger
+from nsm.tasks.fold_barrier import FoldBarrier, Folds, further_training, stronger
 from nsm.tasks.one_mesh import OneMeshMap
 from nsm.tasks.planar import planar_map
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, Term, as_blend, made_terms
@@ -65,12 +66,14 @@ class Param(OneMeshMap):
         self.loss_weights = ParamWeights(**loss_weights)
         held = ParamConstraints(**constraints)
         fixed, self.folds = held.boundary == "fixed", Folds(held.injectivity)
+        apart = held.boundary == "apart"
+        self.boundary_barrier = BoundaryBarrier(*mesh[:2]) if apart else None
         self.map = planar_map(domain if fixed else None, map, activation, encoding, start)
         self.energy = as_blend(energy)
         self.loss_terms = made_terms(loss_terms or {})
         self.phi = phi.eval().requires_grad_(False)
         self.fold_barrier = FoldBarrier(*mesh, every=held.fold_every)
-        self._set_quadrature(held.triangles_from, max_steps, *mesh[:2], self.phi)
+        self.set_quadrature(held.triangles_from, max_steps, *mesh[:2], self.phi)
         self.held_out = HeldOut()
 
     def forward(self, uv: Tensor) -> Tensor:
@@ -84,12 +87,18 @@ class Param(OneMeshMap):
         energy = distortion.mean
         G = self._folding(evaluation)
         U = self._weakest() if w.triangles > 0 else 0.0
+        P = (
+            self.boundary_barrier(self.map, self.global_step)
+            if self.boundary_barrier is not None
+            else 0.0
+        )
 
-        loss = energy + w.injectivity * G + w.triangles * U
+        loss = energy + w.injectivity * G + w.triangles * U + P
         terms: dict[str, Term] = {
             **distortion.terms,
             "injectivity": (w.injectivity, G),
             "triangles": (w.triangles, U),
+            "boundary": (1.0, P),
         }
         for name, term in self.loss_terms.items():
             terms[name] = (term.weight, term(evaluation))
@@ -99,7 +108,7 @@ class Param(OneMeshMap):
 
     def _evaluated(self, batch: Samples) -> tuple[Distortion, Evaluation]:
         """The energy at samples, and what it is made from; φ's part is not recorded."""
-        if self.training and (some := self._triangles(batch)) is not None:
+        if self.training and (some := self.triangles(len(batch.uv))) is not None:
             h = self.map(some.uv)
             sides = some.sides(h)
             return self._on_triangles(some, h, sides, first_fundamental_form(sides))
@@ -122,13 +131,25 @@ class Param(OneMeshMap):
             source, jacobian, _ = self._at(places.uv)
 
         hessians = self._hessians(places, source, jacobian, first_fundamental_form, folding)
-        return [Curvature(self.map, places.uv, hessians)]
+        found = [Curvature(self.map, places.uv, hessians)]
+        if self.boundary_barrier is not None:
+            found.append(self.boundary_barrier.curvature(self.map, self.global_step))
+        return found
+
+    def on_train_start(self) -> None:
+        self._stop_if_converged()  # a resumed training may have been
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        self._stop_if_converged()
+
+    def _stop_if_converged(self) -> None:
+        # the loss is the same in each step, unlike that of maps with multipliers
+        if getattr(self.trainer.optimizers[0], "converged", False):
+            self.trainer.should_stop = True
 
     def strengthen(self, steps: int) -> None:
         """As :meth:`nsm.tasks.constrained.ConstrainedMap.strengthen`."""
         self.loss_weights = stronger(self.loss_weights)
-        if self.quadrature is not None:
-            self.triangles_from = NEWTON_FROM * steps
         further_training(self, steps)
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:

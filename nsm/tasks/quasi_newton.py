@@ -23,6 +23,10 @@ _FLAT = 1e-10  # pairs of less curvature say nothing
 _FIRST = 0.02
 
 
+# relative gain of a step on the last level, below which the next ones gain nothing
+_CONVERGED = 1e-4
+
+
 class _Found(NamedTuple):
     """Loss and gradient on the level."""
 
@@ -100,6 +104,11 @@ class QuasiNewton(Optimizer):
         self.curvatures = curvatures
 
     @property
+    def converged(self) -> bool:
+        """Whether the last step was one of the last level and hardly changed the loss."""
+        return bool(self.state[self.fields[0].coefficients].get("converged", False))
+
+    @property
     def first_length(self) -> float:
         """The length that the line search tries first, in quasi-Newton steps."""
         return float(self.param_groups[0]["lr"])
@@ -129,7 +138,7 @@ class QuasiNewton(Optimizer):
         found = self._evaluated(closure, at)
         if found is None:  # rolled back from a loss that is not finite
             return None
-        known = self.curvatures()
+        before, known = found.value, self.curvatures()
         search = _Search(self.memory, self._metric(known), bool(known))
         for _ in range(self.iterations):
             moved = self._searched(closure, search, at, found)
@@ -138,6 +147,9 @@ class QuasiNewton(Optimizer):
             at, found, stuck = moved
             if stuck and not search.forget():
                 break
+        gained = before - found.value
+        last = number == len(self.counts)
+        state["converged"] = last and gained <= _CONVERGED * abs(before)
         return found.loss
 
     def _evaluated(self, closure: Callable[[], Any], at: np.ndarray) -> _Found | None:
