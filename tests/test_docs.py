@@ -376,8 +376,8 @@ def test_every_option_of_the_configuration_is_on_the_settings_page(site):
         ("scheduler=cosine", "scheduler.warmup", 100),
         ("sampler=fresh_with_vertices", "sampler.vertex_share", 0.1),
         ("loss_weights=overfit", "loss_weights.normal", 0.01),
-        ("loss_weights=pair", "loss_weights.triangles", 100.0),
-        ("constraints=pair", "constraints.multiplier_every", 50),
+        ("loss_weights=adam_pair_map", "loss_weights.triangles", 100.0),
+        ("constraints=adam_pair_map", "constraints.multiplier_every", 50),
         ("data=planar", "data.batch_size", 2048),
     ],
 )
