@@ -55,7 +55,7 @@ PARAM = {
     "loss_weights.triangles": (0.0, TEXT, None),
     "data.batch_size": (1024, CODE, "1,024 (maps)"),
     "certification.repair": (False, TEXT, None),
-    "trainer.max_steps": (50_000, CODE, "50k and 80k steps"),
+    "trainer.max_steps": (80_000, CODE, "50k and 80k steps"),
 }
 PAIR = {
     **PARAM,
@@ -69,7 +69,6 @@ PAIR = {
     "loss_weights.boundary": (1e6, TEXT, "λ_B = 1e6 in the paper"),
     "loss_weights.landmarks": (1e3, TEXT, "λ_C = 1e3"),
     "loss_weights.seam": (0.0, TEXT, None),
-    "trainer.max_steps": (80_000, CODE, "50k and 80k steps"),
 }
 COLLECTION = {
     **PAIR,
