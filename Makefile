@@ -88,9 +88,9 @@ fuzz: .venv/.nsm-dev
 	  tests/test_corpus.py tests/energies tests/maps
 
 # Cost of a step and time to an error, compared with the published recipe and settings: ten minutes;
-# on the GPU where there is one. MESHES adds the waiting times for bunny and animals.
+# on the GPU where there is one.
 bench-speed: .venv/.nsm-dev
-	$(BIN)/python benchmarks/speed.py $(if $(MESHES),--meshes $(MESHES))
+	$(BIN)/python benchmarks/speed.py
 
 # CPU seconds of each stage from raw files to the last file written, and peers by the same figures:
 # ten minutes. PEER is the command of another mapper (see benchmarks/peers.py). MESHES as above.

@@ -80,7 +80,7 @@ def published(file: Path) -> dict[str, dict[str, Any]]:
     found = json.loads(file.read_text())
     labels = {
         "before": "parameterizations of the published recipe, composed",
-        "published, same time": f"{found['form']}, after the default's time",
+        "published, on the way": f"{found['form']}, on the way",
         "published": f"{found['form']}, at its stop",
     }
     entries = {}

@@ -174,6 +174,13 @@ def measured(source: Shape, target: Shape, kind: str, cut: str, share: float) ->
         "given": len(pairs),
         "median": round(f.metrics["symmetric_dirichlet_median"], 3),
         "p95": round(f.metrics["symmetric_dirichlet_p95"], 2),
+        **{
+            key: round(f.metrics[key], 4)
+            for key in (
+                *("start_symmetric_dirichlet_median", "start_symmetric_dirichlet_p95"),
+                *("flipped_before_repair_percent", "flipped_percent"),
+            )
+        },
         "landmarks missed": round(f.metrics["landmark_error_max_percent"], 4),
         "covered": round(f.metrics["covered_percent"], 1),
         "certified": bool(f.certificate["certified"]),

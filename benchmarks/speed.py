@@ -4,7 +4,7 @@ Variants that are compared run in turn, round by round; results are medians. On 
 CPU time of the process (all its threads), which other programs disturb little; on a GPU it is
 wall-clock time, synchronized. The GPU is used where there is one.
 
-    python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N] [--meshes FOLDER]
+    python benchmarks/speed.py [--mesh FILE] [--seconds LIMIT] [--threads N]
 """
 
 from __future__ import annotations
@@ -22,14 +22,12 @@ from typing import Any
 import numpy as np
 import published_step as published
 import scale
-import surface_training
 import torch
 import waiting
 from omegaconf import DictConfig
 from torch import Tensor, nn
 from training import module_of, samples_of
 
-import nsm
 from nsm.config import compose_config
 from nsm.data import Samples, SurfaceData
 from nsm.domains import Surface
@@ -51,8 +49,6 @@ ERRORS = (1.0, 0.5, 0.2, 0.1)  # RMS in percent of the diagonal
 SHARES = (0.5, 0.8, 0.9, 0.95)  # of the decrease from the domain's distortion to the least found
 SURFACES = 3
 BATCHED = (2, 4, 16)  # surfaces in one batch
-LENGTHS = (500, 1000, 2000, 4000, 8000)  # steps of the trainings that try to reach GOAL
-GOAL = 0.1  # RMS in percent of the diagonal
 NEVER = 10**12  # steps
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -89,6 +85,8 @@ def config_of(task: str, settings: str) -> DictConfig:
     overrides = [f"task={task}", "seed=0"]
     if settings == "paper":
         overrides += ["experiment=paper"]
+    elif task == "pair_map":  # the default has steps of two kinds
+        overrides += ["experiment=adam"]
     return compose_config(overrides)
 
 
@@ -456,53 +454,11 @@ def batches(rounds: int) -> dict[str, Any]:
     return found
 
 
-def goals(meshes: Path) -> dict[str, Any]:
-    """Wall-clock seconds that a user waits: for the bunny as a network of GOAL RMS error, and for
-    a map of two animals whose networks are trained."""
-    found: dict[str, Any] = {"goal_percent": GOAL}
-    bunny = Surface.load(str(meshes / "stanford-bunny.obj"))
-    marks = [str(meshes / "landmarks" / f"shrec07-{k}.vts") for k in (384, 388)]
-    animals = [str(meshes / f"shrec07-{k}.off") for k in (384, 388)]
-    ready = nsm.map_pair(*animals, marks, overrides=["trainer.max_steps=1"], progress=False)
-    for compiled in (False, True):
-        settings = [f"trainer.compile={str(compiled).lower()}"]
-        runs = []
-        for steps in LENGTHS:
-            start = time.perf_counter()
-            length = [*settings, f"trainer.max_steps={steps}"]
-            phi = nsm.overfit(bunny, overrides=length, progress=False)
-            seconds, rms = time.perf_counter() - start, phi.metrics["rms_percent"]
-            runs.append({"steps": steps, "seconds": seconds, "rms_percent": rms})
-            if rms <= GOAL:
-                break
-        start = time.perf_counter()
-        f = nsm.map_pair(
-            ready.source,
-            ready.target,
-            ready.landmarks.tolist(),
-            overrides=settings,
-            progress=False,
-        )
-        seconds = time.perf_counter() - start
-        kept = (
-            "start_symmetric_dirichlet_median",
-            "symmetric_dirichlet_median",
-            "flipped_before_repair_percent",
-            "flipped_percent",
-            "landmark_error_max_percent",
-        )
-        found["compiled" if compiled else "as_it_is"] = {
-            "bunny": runs,
-            "pair_map": {"seconds": seconds, **{key: f.metrics[key] for key in kept}},
-        }
-        print(json.dumps(found, indent=1), flush=True)
-    return found
-
-
-def _before(metrics: dict[str, float]) -> str:
-    """Flips before repair; a dash where an older version did not count them."""
-    key = "flipped_before_repair_percent"
-    return f"{metrics[key]:.3f} %" if key in metrics else "–"
+def _named(key: str) -> str:
+    """The task and settings of a step, as ``config_of`` takes them."""
+    task, settings = key.split("/")
+    network = task == "pair_map" and settings == "default"
+    return f"{task}, {'experiment=adam' if network else settings}"
 
 
 def page(results: dict[str, Any]) -> str:
@@ -522,13 +478,15 @@ def page(results: dict[str, Any]) -> str:
             "",
             "Loss and gradient, compared with a plain restatement of the published recipe (one "
             "`autograd.grad` per output, batched SVD and explicit inverse) for the same networks "
-            f"and batch. The collection has {SURFACES} surfaces.",
+            f"and batch. The collection has {SURFACES} surfaces. The pair map's default begins "
+            "with steps of Adam on a spline and ends with quasi-Newton steps, which the recipe has "
+            "no counterpart of: the network of `experiment=adam` takes its place.",
             "",
             "| task, settings | published, ms | nsm, ms | speed-up |",
             "|---|---|---|---|",
         ]
         lines += [
-            f"| {key.replace('/', ', ')} | {v['published_milliseconds']:.1f} | "
+            f"| {_named(key)} | {v['published_milliseconds']:.1f} | "
             f"{v['nsm_milliseconds']:.1f} | {v['ratio']:.2f} |"
             for key, v in results["costs"].items()
         ]
@@ -615,27 +573,6 @@ def page(results: dict[str, Any]) -> str:
             "With compiled evaluation (`trainer.compile=true`) a step is "
             f"{b['compiled']['ratio']:.2f} times as fast.",
         ]
-    if "goals" in results:
-        g = results["goals"]
-        lines += [
-            "",
-            "## Waiting time",
-            "",
-            f"Wall-clock time until the RMS error of the bunny is {g['goal_percent']} % of the "
-            "diagonal, for trainings of growing length; and of a map of two animals from their "
-            f"networks, whose distortion is {LEAST_SYMMETRIC_DIRICHLET} at best.",
-            "",
-            "| evaluation | bunny: steps, RMS, seconds "
-            "| map: median distortion, flips before repair, after, seconds |",
-            "|---|---|---|",
-        ]
-        lines += [
-            f"| {name.replace('_', ' ')} | {last['steps']}, {last['rms_percent']:.3f} %, "
-            f"{last['seconds']:.0f} | {pair['symmetric_dirichlet_median']:.3f}, "
-            f"{_before(pair)}, {pair['flipped_percent']:.3f} %, {pair['seconds']:.0f} |"
-            for name in ("as_it_is", "compiled")
-            for last, pair in [(g[name]["bunny"][-1], g[name]["pair_map"])]
-        ]
     if "memory" in results:
         lines += [
             "",
@@ -650,8 +587,6 @@ def page(results: dict[str, Any]) -> str:
             f"| {k} | {v['published_mib']:.0f} | {v['nsm_mib']:.0f} | {v['ratio']:.1f} |"
             for k, v in results["memory"].items()
         ]
-    if surface_training.RESULTS.exists():
-        lines += surface_training.section(json.loads(surface_training.RESULTS.read_text()))
     if waiting.RESULTS.exists():
         lines += waiting.section(json.loads(waiting.RESULTS.read_text()))
     if scale.RESULTS.exists():
@@ -664,7 +599,7 @@ def write_page() -> None:
     PAGE.write_text(page(json.loads((RESULTS / "speed.json").read_text())))
 
 
-PARTS = ("costs", "peak", "growth", "batches", "memory", "times", "goals")
+PARTS = ("costs", "peak", "growth", "batches", "memory", "times")
 
 
 def main() -> None:
@@ -673,17 +608,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0, help="limit of one training")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument(
-        "--meshes", type=Path, help="folder of bunny and animals: adds the waiting times"
-    )
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="all by default")
     parser.add_argument(
         "--output", type=Path, help="folder of the JSON file; then no page is written"
     )
     arguments = parser.parse_args()
-    parts = arguments.parts or [p for p in PARTS if p != "goals" or arguments.meshes]
-    if "goals" in parts and not (arguments.meshes and arguments.meshes.is_dir()):
-        parser.error("goals need the folder of the meshes; give it with --meshes")
+    parts = arguments.parts or PARTS
     torch.set_num_threads(arguments.threads)
     cuda = DEVICE.type == "cuda"
     device = torch.cuda.get_device_name() if cuda else f"{os.cpu_count()} CPU cores"
@@ -703,7 +633,6 @@ def main() -> None:
         "batches": lambda: batches(arguments.rounds),
         "memory": memory,
         "times": lambda: times(arguments.mesh, arguments.seconds),
-        "goals": lambda: goals(arguments.meshes),
     }
     for part in parts:  # stored one by one: an interrupted run keeps what it has
         found = make[part]()

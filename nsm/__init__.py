@@ -9,13 +9,14 @@ Examples:
 
 from __future__ import annotations
 
-import random
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from nsm.loading_libraries import loading_libraries
+
 if TYPE_CHECKING:
-    from nsm.api import load, map_collection, map_pair, overfit, parameterize
+    from nsm.api import map_collection, map_pair, overfit, parameterize
     from nsm.domains import Surface
     from nsm.errors import NsmError
     from nsm.extensions import (
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         register_encoding,
         register_energy,
     )
+    from nsm.result_folders import load
     from nsm.results import NeuralSurface, Parameterization, SurfaceCollection, SurfaceMap
     from nsm.surfaces import catalogue_names
 
@@ -57,7 +59,7 @@ _HOME = {
     "map_collection": "nsm.api",
     "map_pair": "nsm.api",
     "catalogue_names": "nsm.surfaces",
-    "load": "nsm.api",
+    "load": "nsm.result_folders",
     "Parameterization": "nsm.results",
     "overfit": "nsm.api",
     "parameterize": "nsm.api",
@@ -77,13 +79,10 @@ def __getattr__(name: str) -> Any:
     # torch and Lightning take seconds to import: what needs neither should not wait for them
     if name not in _HOME and name not in _PACKAGES:
         raise AttributeError(f"module 'nsm' has no attribute {name!r}")
-    state = random.getstate()  # Lightning draws random numbers when it is imported
-    try:
+    with loading_libraries():
         if name in _PACKAGES:
             return import_module(f"nsm.{name}")
         return getattr(import_module(_HOME[name]), name)
-    finally:
-        random.setstate(state)
 
 
 def __dir__() -> list[str]:

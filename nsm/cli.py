@@ -24,6 +24,7 @@ from nsm.arguments import Arguments
 from nsm.command_line import prepared_overrides, with_task
 from nsm.config import conf_folder, read_config, register, setting_error
 from nsm.errors import NsmError, of_disk
+from nsm.loading_libraries import loading_libraries
 from nsm.plugins import import_here, import_plugins
 from nsm.run_directories import remove_empty
 from nsm.stages import stage
@@ -190,16 +191,17 @@ def _run(config: DictConfig, *, shown: bool = False) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     try:
         # training libraries take seconds to import: --help and misspelt settings need not wait
-        with stage(Console(highlight=False, markup=False, stderr=shown), "loading libraries"):
+        console = Console(highlight=False, markup=False, stderr=shown)
+        with stage(console, "loading libraries"), loading_libraries(frozen=True):
             from nsm.config_validation import checked
+            from nsm.pipeline import run
 
             complete = checked(config, overrides)
-            if shown:
-                print(OmegaConf.to_yaml(complete, resolve=True), end="")
-                return
-            if complete.resume is not None:
-                _check_alone(str(complete.resume), overrides)
-            from nsm.pipeline import run
+        if shown:
+            print(OmegaConf.to_yaml(complete, resolve=True), end="")
+            return
+        if complete.resume is not None:
+            _check_alone(str(complete.resume), overrides)
 
         run(complete, folder)
     finally:

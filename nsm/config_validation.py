@@ -102,6 +102,7 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
     module = getattr(task, "module", None)
     for key, name in (("constraints", "Constraints"), ("loss_weights", "Weights")):
         result[key] = _of_task(key, settings.get(key), getattr(module, name, None), result)
+    _check_parts_of_map(result["map"]["_target_"], given)
     _build(result)
     if result["phi"]["overrides"]:
         from nsm.config import compose_config
@@ -109,6 +110,20 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
         compose_config(["task=overfit", *result["phi"]["overrides"]])
     order = [key for key in (*GROUPS, *everything) if key in result]
     return OmegaConf.create({key: result[key] for key in dict.fromkeys(order)})
+
+
+def _check_parts_of_map(target: str, given: Iterable[str]) -> None:
+    """NsmError for an activation or encoding that is given beside a map which has none."""
+    known, others = parameters(_imported("map._target_", target))
+    for group in ("activation", "encoding"):
+        mine = [key for key in given if key == group or key.startswith(f"{group}.")]
+        if mine and not others and group not in known:
+            raise NsmError(
+                f"{mine[0]}: {target} has no {group}; omit it, or choose a network by map=mlp (for "
+                "a map of two surfaces with experiment=adam)",
+                kind="conflicting_settings",
+                key=mine[0],
+            )
 
 
 def _target(key: str, group: str, node: Any, given: Iterable[str]) -> dict[str, Any]:

@@ -211,9 +211,15 @@ def test_a_sweep_of_energies_is_for_every_map(task):
     assert compose_config(["sweep=energy", f"task={task}"]).task.name == task
 
 
-def test_no_grid_hides_the_activation_in_its_sweep():
-    config = compose_config(["sweep=activation"])
+@pytest.mark.parametrize("sweep", ["activation", "architecture"])
+@pytest.mark.parametrize(
+    "task", ["task=overfit", "task=param", "task=collection_map", "task=pair_map experiment=adam"]
+)
+def test_sweeps_of_networks_train_networks_without_a_grid(sweep, task):
+    config = compose_config([f"sweep={sweep}", *task.split()])
     assert config.encoding._target_ == "nsm.maps.encodings.Identity"
+    assert config.map._target_ == "nsm.maps.NeuralMap"  # on closed domains, too
+    assert config.optimizer._target_ == "torch.optim.Adam"
 
 
 @pytest.mark.parametrize(
@@ -226,6 +232,11 @@ def test_no_grid_hides_the_activation_in_its_sweep():
         ("surface=bunnny", "unknown_option", "surface"),
         ("domain=squre", "unknown_option", "domain"),
         ("task=overfit experiment=fast", "unknown_option", "experiment"),
+        # a spline has none of them
+        ("task=pair_map activation=relu", "conflicting_settings", "activation"),
+        ("task=pair_map encoding.degree=3", "conflicting_settings", "encoding.degree"),
+        ("task=param experiment=fast encoding=fourier", "conflicting_settings", "encoding"),
+        ("task=pair_map sweep=architecture", None, "optimizer"),
         ("trainer.max_steps=many", "wrong_type", "trainer.max_steps"),
         ("trainer.accelerator=gppu", "unknown_option", "trainer.accelerator"),
         ("trainer.precision=half", "unknown_option", "trainer.precision"),

@@ -172,7 +172,7 @@ def rows(text):
         (
             "optimization",
             "## Error over time",
-            ["overfit.md", "steps.md", "quasi_newton.md", "quasi_newton_trials.md", "peers.md"],
+            ["overfit.md", "steps.md", "peers.md"],
         ),
         ("activations", "| activation |", ["activation.md"]),
         ("robustness", "<!-- table -->", ["torture.md"]),

@@ -61,7 +61,7 @@ PARAM = {
     "certification.repair": (False, TEXT, None),
     "trainer.log_every": (25, OURS, None),
     "trainer.tabulated": (None, TEXT, None),
-    "trainer.max_steps": (50_000, CODE, "50k and 80k steps"),
+    "trainer.max_steps": (80_000, CODE, "50k and 80k steps"),
 }
 PAIR = {
     **PARAM,
@@ -72,7 +72,6 @@ PAIR = {
     "loss_weights.boundary": (1e6, TEXT, "λ_B = 1e6 in the paper"),
     "loss_weights.landmarks": (1e3, TEXT, "λ_C = 1e3"),
     "loss_weights.seam": (0.0, TEXT, None),
-    "trainer.max_steps": (80_000, CODE, "50k and 80k steps"),
 }
 COLLECTION = {
     **PAIR,

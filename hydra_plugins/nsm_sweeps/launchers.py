@@ -20,6 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nsm.errors import NsmError
+from nsm.loading_libraries import loading_libraries
 from nsm.optional_dependencies import needed
 from nsm.sweeps import OUTCOMES, Job, Outcome, is_complete, job_folder, swept_keys
 
@@ -68,7 +69,9 @@ class SweepLauncher(Launcher):
         raise NotImplementedError
 
     def _job(self, overrides: Sequence[str]) -> Job:
-        from nsm.config_validation import checked
+        with loading_libraries(frozen=True):
+            from nsm.config_validation import checked
+            from nsm.pipeline import sweep_jobs  # noqa: F401  # which the jobs need
 
         hydra = self.config.hydra
         keys = swept_keys(hydra.overrides.task, hydra.sweeper.params)
@@ -236,9 +239,7 @@ class Resumable:
     """A job as submitit runs it; one that runs out of time continues from its checkpoint."""
 
     def __call__(self, settings: dict[str, Any], folder: str, cwd: str) -> str | None:
-        from nsm.pipeline.sweep_jobs import run_job
-
-        return run_job(settings, folder, cwd, log=True)
+        return run_in_process(Path(folder), settings, folder, cwd)[1]
 
     def checkpoint(self, *call: Any) -> Any:
         """The job to be queued again."""
@@ -294,7 +295,8 @@ def run_in_process(
     place: Path, settings: dict[str, Any], folder: str, cwd: str
 ) -> tuple[Path, str | None]:
     """Run a job in its own process; give its first argument back with why it failed, or None."""
-    from nsm.pipeline.sweep_jobs import run_job
+    with loading_libraries(frozen=True):
+        from nsm.pipeline.sweep_jobs import run_job
 
     return place, run_job(settings, folder, cwd, log=True)
 

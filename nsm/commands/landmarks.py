@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from nsm.arguments import Arguments
 from nsm.commands import add_address
 from nsm.errors import NsmError
+from nsm.loading_libraries import loading_libraries
 from nsm.optional_dependencies import needed
 
 if TYPE_CHECKING:
@@ -71,8 +72,9 @@ def main(arguments: list[str]) -> None:
     part = _part(given.parts)
     needed("viser", "nsm landmarks", "view")
     # torch takes seconds to import, which --help and wrong options do not need
-    from nsm.results.view import LandmarkEditor, running
-    from nsm.surfaces.validation import Repairs
+    with loading_libraries(frozen=True):
+        from nsm.results.view import LandmarkEditor, running
+        from nsm.surfaces.validation import Repairs
 
     shapes = [_shape(name, Repairs(part, given.repair)) for name in given.mesh]
     landmarks = _start(shapes, given.landmarks, given.empty)

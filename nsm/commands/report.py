@@ -6,6 +6,7 @@ from pathlib import Path
 
 from nsm.arguments import Arguments
 from nsm.commands import add_trust
+from nsm.loading_libraries import loading_libraries
 
 
 def main(arguments: list[str]) -> None:
@@ -41,7 +42,8 @@ def main(arguments: list[str]) -> None:
     add_trust(parser)
     given = parser.parse_args(arguments)
     # torch takes seconds to import, which --help and wrong options do not need
-    from nsm.results.report import write_report
+    with loading_libraries(frozen=True):
+        from nsm.results.report import write_report
 
     runs, incomplete = write_report(given.folders, given.output, given.title, given.trust, given.up)
     others = f", {incomplete} incomplete or damaged" if incomplete else ""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nsm.arguments import Arguments
 from nsm.commands import add_address, add_trust
+from nsm.loading_libraries import loading_libraries
 from nsm.optional_dependencies import needed
 
 
@@ -31,8 +32,9 @@ def main(arguments: list[str]) -> None:
     given = parser.parse_args(arguments)
     needed("viser", "nsm view", "view")
     # torch takes seconds to import, which --help and wrong options do not need
-    from nsm.api import load
-    from nsm.results.view import serving
+    with loading_libraries(frozen=True):
+        from nsm.result_folders import load
+        from nsm.results.view import serving
 
     result = load(given.folder, trust=given.trust)
     with serving(result, given.host, given.port) as (_, address):

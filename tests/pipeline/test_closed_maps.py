@@ -24,7 +24,7 @@ from nsm.errors import NsmError
 from nsm.pipeline.automatic_domain import choose_domain
 from nsm.results.metrics import evaluate
 
-QUICK = [*tiny.QUICK, "encoding.resolutions=[8,16]", "trainer.max_steps=100"]
+QUICK = [*tiny.QUICK, "trainer.max_steps=100"]
 MADE = (
     'phi.overrides=["experiment=quick","trainer.threads=1","encoding.resolutions=[16,64]",'
     '"data.batch_size=512","data.held_out=512","trainer.max_steps=20"]'
@@ -210,6 +210,7 @@ def test_collections_are_certified_and_their_cycles_close(shapes, tmp_path, doma
     third = trimesh.load(files[0], process=False)
     path = _exported(tmp_path, "third", third.vertices[:, [1, 2, 0]] * [1, 1.2, 1], third.faces)
     overrides = [f"domain={domain}", *QUICK, MADE, "trainer.max_steps=60"]
+    overrides.append("encoding.resolutions=[8,16]")
     folder = tmp_path / "run"
     g = nsm.map_collection(
         [*files, path], [marks] * 3, overrides=overrides, folder=folder, progress=False

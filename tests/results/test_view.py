@@ -442,7 +442,7 @@ def test_trusted_modules_reach_the_loader(monkeypatch):
     def load(folder, trust=()):
         raise Loaded(str(folder), list(trust))
 
-    monkeypatch.setattr("nsm.api.load", load)
+    monkeypatch.setattr("nsm.result_folders.load", load)
     for words in (["--trust", "a.b", "--trust", "c"], ["--trust=a.b, c"]):
         with pytest.raises(Loaded) as caught:
             view.main(["run", *words])
