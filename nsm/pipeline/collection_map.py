@@ -20,6 +20,7 @@ from nsm.domains.orbifold.collection_alignment import alignments_to_first, disag
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.collection_inputs import collected
+from nsm.pipeline.configured_surface import configured_repairs
 from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_landmarks
 from nsm.pipeline.landmark_inputs import name_of
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
@@ -115,7 +116,8 @@ class CollectionMapTask(Task):
             self.console,
             template=self.has_template,
         )
-        self.check = check_landmarks(shapes, ids, self.console)
+        repairs = configured_repairs(self.config)
+        self.check = check_landmarks(shapes, ids, self.console, repairs, self.proposed)
         draw = partial(draw_landmarks, self.folder, landmarks=ids)
         self.use(neural_surfaces(self.config, shapes, ids, self.console, draw), ids)
 

@@ -109,9 +109,9 @@ class PairMapTask(Task):
         shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
-        self.check = check_landmarks(shapes, ids, self.console)
-        self.attributes = read_attributes(settings["attributes"], counts)
         repairs = configured_repairs(self.config)
+        self.check = check_landmarks(shapes, ids, self.console, repairs, self.proposed)
+        self.attributes = read_attributes(settings["attributes"], counts)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
         draw = partial(draw_landmarks, self.folder, landmarks=ids)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw)
