@@ -27,7 +27,7 @@ _STRAINED = 8.0  # energy of a strained map: then the landmarks at the cones are
 # gains from which on a change is told. Measured, see docs/correspondence.md
 
 Kind = Literal["mirrored", "exchanged", "wrong"]
-_LEAST: dict[Kind, float] = {"mirrored": 0.25, "exchanged": 0.3, "wrong": 0.45}
+_LEAST: dict[Kind, float] = {"mirrored": 0.25, "exchanged": 0.25, "wrong": 0.45}
 
 
 class Change(NamedTuple):
@@ -145,6 +145,7 @@ class _Maps:
         changes = _changes(before, trials[1:], energies[1:])
         if before > _STRAINED:
             changes += self._without_cones(before, four)
+            changes += self._worst_exchanged(before, changes)
         return CoarseCheck(before, changes)
 
     def _without(self, k: int) -> _Trial:
@@ -153,12 +154,27 @@ class _Maps:
 
     def _exchanges(self, four: np.ndarray) -> Iterator[_Trial]:
         """Two landmarks exchanged, of which both or none are cones."""
-        everything = np.arange(self.count)
         for i, j in combinations(range(self.count), 2):
             if (i in four) == (j in four):
-                order = everything.copy()
-                order[[i, j]] = j, i
-                yield _Trial(("exchanged", (i, j)), order, everything)
+                yield self._exchange(i, j)
+
+    def _exchange(self, i: int, j: int) -> _Trial:
+        everything = np.arange(self.count)
+        order = everything.copy()
+        order[[i, j]] = j, i
+        return _Trial(("exchanged", (i, j)), order, everything)
+
+    def _worst_exchanged(self, before: float, changes: list[Change]) -> list[Change]:
+        """The two landmarks without which the map is best, exchanged, if they were not yet."""
+        without = sorted((c for c in changes if c.kind == "wrong"), key=lambda c: -c.gain)
+        two = tuple(sorted(c.landmarks[0] for c in without[:2]))
+        tried = {c.landmarks for c in changes}
+        cones = [four for four in self.sets if np.isin(two, four).sum() != 1]
+        if len(two) < 2 or two in tried or not cones:
+            return []
+        trials = [self._exchange(*two)]
+        energies = self._energies(cones[0], trials)
+        return [] if energies is None else _changes(before, trials, energies)
 
     def _without_cones(self, before: float, four: np.ndarray) -> list[Change]:
         """The landmarks at the cones left out, one by one, with few other sets of cones."""
