@@ -23,7 +23,7 @@ _FACES = 500
 _SPREAD = 6  # landmarks among which the four at the cones are chosen
 _ROUND = Round(0, 5, 30)
 _EXCHANGED = 8  # landmarks at most of which two are exchanged: pairs are many
-_STRAINED = 8.0  # energy of a strained map: then the landmarks at the cones are left out, too
+_STRAINED = 10.0  # energy of a strained map: then the landmarks at the cones are left out, too
 # gains from which on a change is told. Measured, see docs/correspondence.md
 
 Kind = Literal["mirrored", "exchanged", "wrong"]

@@ -50,7 +50,7 @@ from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, export_ply, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
-from nsm.stages import at, counted, stage
+from nsm.stages import counted, done_in_turn, stage
 from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import (
@@ -292,13 +292,12 @@ class CollectionMapTask(Task):
             (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
-        for name, draw in (
-            ("figures.png", figures_picture),
-            ("transfer.png", transfer_matrix_picture),
-            ("cycle.png", cycle_picture),
-        ):
-            at(name)
-            draw(folder / name, result)
+        draws = {
+            "figures.png": figures_picture,
+            "transfer.png": transfer_matrix_picture,
+            "cycle.png": cycle_picture,
+        }
+        done_in_turn("pictures", {n: partial(d, folder / n, result) for n, d in draws.items()})
         names = [re.sub(r"[/\\]", "_", name) for name in result.names]
         pairs = list(itertools.permutations(range(len(result)), 2))
         kept = [ends for ends in pairs if 0 in ends or not self.has_template]
