@@ -24,6 +24,8 @@ _SPREAD = 6  # landmarks among which the four at the cones are chosen
 _ROUND = Round(0, 5, 30)
 _EXCHANGED = 8  # landmarks at most of which two are exchanged: pairs are many
 _STRAINED = 10.0  # energy of a strained map: then the landmarks at the cones are left out, too
+# energies from which on landmarks are doubted as a whole; few are on like shapes met with less
+_FEW, _STRAINED_FEW, _STRAINED_MANY = 5, 16.0, 30.0
 # gains from which on a change is told. Measured, see docs/correspondence.md
 
 Kind = Literal["mirrored", "exchanged", "wrong"]
@@ -57,16 +59,23 @@ class CoarseCheck:
     Attributes:
         energy: mean symmetric Dirichlet energy of the map that meets all of them.
         changes: those that were tried.
+        count: of the landmarks.
     """
 
     energy: float
     changes: list[Change]
+    count: int
 
     @property
     def best(self) -> Change | None:
         """The change that the shapes want most; None if none gains enough."""
         found = max(self.changes, key=lambda change: change.excess, default=None)
         return found if found is not None and found.excess > 0 else None
+
+    @property
+    def strained(self) -> bool:
+        """Whether the map through all landmarks is more distorted than those of like shapes."""
+        return self.energy > (_STRAINED_FEW if self.count <= _FEW else _STRAINED_MANY)
 
     @property
     def explained(self) -> bool:
@@ -79,7 +88,7 @@ class CoarseCheck:
             change._replace(landmarks=tuple(numbers[list(change.landmarks)].tolist()))
             for change in self.changes
         ]
-        return CoarseCheck(self.energy, changes)
+        return CoarseCheck(self.energy, changes, self.count)
 
 
 def coarse_check(
@@ -146,7 +155,7 @@ class _Maps:
         if before > _STRAINED:
             changes += self._without_cones(before, four)
             changes += self._worst_exchanged(before, changes)
-        return CoarseCheck(before, changes)
+        return CoarseCheck(before, changes, self.count)
 
     def _without(self, k: int) -> _Trial:
         everything = np.arange(self.count)

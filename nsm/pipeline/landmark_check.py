@@ -83,10 +83,18 @@ class LandmarkCheck:
         )
 
     def _of_coarse_map(self) -> str | None:
-        """The change that coarse maps want most, and between which shapes."""
+        """The change that coarse maps want most, and between which shapes; or that none helps."""
         wanted = [(one.best, k) for k, one in self.coarse.items() if one.best is not None]
         if not wanted:
-            return None
+            strained = [(one.energy, k) for k, one in self.coarse.items() if one.strained]
+            if not strained:
+                return None
+            energy, k = max(strained)
+            return (
+                f"the landmarks do not fit the shapes: a coarse map of {self.names[0]} to "
+                f"{self.names[k]} through all of them has the mean distortion {energy:.1f} (4 at "
+                "best, 5 to 12 for like shapes)"
+            )
         change, other = max(wanted, key=lambda entry: entry[0].excess)
         return _sentence(
             change,

@@ -5,9 +5,9 @@ import pytest
 from limbs import star
 from rich.console import Console
 
-from nsm.correspondence import coarse_check
+from nsm.correspondence import CoarseCheck, coarse_check
 from nsm.domains.joint_preparation import Mesh
-from nsm.pipeline.landmark_check import check_landmarks
+from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks
 from nsm.surfaces.shapes import hemisphere
 
 V, F, TIPS = star([1.5, 1.2, 0.9, 1.0, 1.4])
@@ -45,6 +45,14 @@ def test_two_exchanged_ones_are_named(right):
     found = coarse_check(*SHAPES, (TIPS[:4], TIPS[[1, 0, 2, 3]]))
     assert (found.best.kind, found.best.landmarks) == ("exchanged", (0, 1))
     assert found.energy * np.exp(-found.best.gain) < 1.2 * right.energy
+
+
+def test_a_map_that_no_change_helps_is_told_as_a_whole():
+    checks = {1: CoarseCheck(40.0, [], 4)}
+    check = LandmarkCheck(["a", "b"], [TIPS, TIPS], None, checks)
+    assert "a coarse map of a to b" in check.warning.plain and "40.0" in check.warning.plain
+    check = LandmarkCheck(["a", "b"], [TIPS, TIPS], None, {1: CoarseCheck(12.0, [], 4)})
+    assert check.warning is None and not check.figures["landmarks_doubtful"]
 
 
 def test_a_mirror_image_is_told():
