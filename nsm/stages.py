@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
@@ -150,3 +150,10 @@ def counted(step: str, items: Sequence[T]) -> Iterator[T]:
     for k, item in enumerate(items):
         at(step, k, len(items))
         yield item
+
+
+def done_in_turn(step: str, works: Mapping[str, Callable[[], object]]) -> None:
+    """Do pieces of work one after the other, each a counted step of the work, with its name."""
+    for k, (name, work) in enumerate(works.items()):
+        at(step, k, len(works), name)
+        work()

@@ -115,3 +115,10 @@ def test_a_training_says_its_step_while_that_lasts(often):
     assert not stages.showing()
     lines = [line for line in console.file.getvalue().splitlines() if "2/5" in line]
     assert len(lines) >= 3 and "loss 5.00e-01  error 2.000 %" in lines[-1]
+
+
+def test_works_in_turn_are_counted_and_named(monkeypatch):
+    done, told = [], []
+    monkeypatch.setattr(stages, "at", lambda *of: told.append(of))
+    stages.done_in_turn("files", {"a": lambda: done.append(1), "b": lambda: done.append(2)})
+    assert done == [1, 2] and told == [("files", 0, 2, "a"), ("files", 1, 2, "b")]

@@ -81,6 +81,11 @@ class CommonAgreement:
         own = self.of(self.worst[0])
         return sum(found.doubtful for found in own) > len(own) / 2
 
+    @property
+    def unrelated(self) -> bool:
+        """Whether distances on the worst surface hardly go with those on the others."""
+        return self.correlation(self.worst[0]) < _RELATED_ALL
+
 
 def agreement(
     meshes: Sequence[tuple[np.ndarray, np.ndarray]], landmarks: Sequence[np.ndarray]

@@ -72,6 +72,7 @@ def coarse_shape(
     faces: np.ndarray,
     tips: np.ndarray | None = None,
     fixed: np.ndarray | None = None,
+    count: int = _FACES,
 ) -> CoarseShape:
     """The coarse shape of a closed mesh (V, 3), (F, 3) of genus 0.
 
@@ -79,6 +80,7 @@ def coarse_shape(
         vertices, faces: the mesh.
         tips: (K,) vertices that stand for the tips, which are found if not given.
         fixed: (G,) vertices, landmarks that are given; tips near them are left out.
+        count: of its faces, about.
 
     Raises:
         NsmError: ``wrong_topology`` for any other mesh; ``no_proposal`` for one with fewer than
@@ -111,7 +113,7 @@ def coarse_shape(
             kind="no_proposal",
             key="landmarks",
         )
-    coarse, ids = decimated(vertices, faces, _FACES, tips)
+    coarse, ids = decimated(vertices, faces, count, tips)
     points = vertices[ids]
     area = topology.face_areas(points, coarse)
     corner = np.bincount(coarse.ravel(), np.repeat(area / 3, 3), minlength=len(ids)) / area.sum()

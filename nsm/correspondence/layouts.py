@@ -135,11 +135,17 @@ def table(laid_out: Layout) -> Table:
     return Table(*(np.roll(a, (half, half), axis=(0, 1)) for a in (vertex, logs)))
 
 
-def affine_maps(source: Layout, target: Layout) -> list[tuple[np.ndarray, np.ndarray]]:
+def affine_maps(
+    source: Layout, target: Layout, determinant: int = 1
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """The maps x ↦ B x + c of the orbifold to itself that distort least.
 
-    B in SL(2, Z), up to sign, and c a half lattice point. They take the cones to one another in
-    all 24 orders; for each order a few isotopy classes.
+    B is a matrix of integers, up to sign, and c a half lattice point. They take the cones to one
+    another in all 24 orders; for each order a few isotopy classes.
+
+    Args:
+        source, target: the layouts.
+        determinant: of B; -1 for maps that turn the orientation around.
 
     Returns:
         matrices B (2, 2) and shifts c (2,), in coordinates of Ω.
@@ -150,7 +156,8 @@ def affine_maps(source: Layout, target: Layout) -> list[tuple[np.ndarray, np.nda
     for entries in product(range(-_LARGEST_ENTRY, _LARGEST_ENTRY + 1), repeat=4):
         matrix = np.array(entries).reshape(2, 2)
         first = next((e for e in entries if e), 0)
-        if matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0] != 1 or first < 0:
+        det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+        if det != determinant or first < 0:
             continue
         cost = float(((theirs @ matrix @ back) ** 2).sum())
         of_class.setdefault(np.mod(matrix, 2).tobytes(), []).append((cost, matrix))

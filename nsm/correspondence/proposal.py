@@ -10,6 +10,7 @@ from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
+from nsm.stages import counted
 
 # two maps differ if their images are this far apart in the mean, over √area, or if they take an end
 # of a limb to ends of two limbs
@@ -91,7 +92,7 @@ def proposed(
 def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:
     """Correspondences of two coarse shapes that differ from each other, best first."""
     found = candidates(source, target)
-    for one in MENDING:
+    for one in counted("tips drawn together", MENDING):
         found = mended(found, one)
     kept: list[Hypothesis] = []
     for hypothesis in sorted(map(_hypothesis, found), key=lambda h: h.score):

@@ -21,7 +21,7 @@ from nsm.correspondence.refinement import Anchors, Batch, Sines, refined
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
 from nsm.errors import NsmError
-from nsm.stages import at
+from nsm.stages import at, counted
 
 _SOURCE_SETS = 4
 _TARGET_SETS = 20
@@ -105,14 +105,13 @@ def candidates(
         NsmError: ``no_proposal``: no map meets the landmarks that are given; ``not_injective``:
             of five or more, all fours are too close to each other.
     """
-    at("layouts")
     if source.given >= COMMON:
         found = through_four(source, target, np.arange(source.given))
         drawn = [fixed_pairs(found[0])] * len(found)
         return sorted(trained(found, _THROUGH, drawn=drawn), key=lambda c: c.cost)
     sets, scores = quick_scores(source)
-    ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]])
-    theirs = _laid_out(target, _similar_sets(ours, target))
+    ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]], "layouts of the source")
+    theirs = _laid_out(target, _similar_sets(ours, target), "layouts of the target")
     tables = [table(one) for one in theirs]
     found = [
         candidate
@@ -191,8 +190,8 @@ def pose(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.asarray(left @ flip @ right)
 
 
-def _laid_out(shape: CoarseShape, sets: np.ndarray) -> list[Layout]:
-    every = [layout(shape, four) for four in sets]
+def _laid_out(shape: CoarseShape, sets: np.ndarray, step: str) -> list[Layout]:
+    every = [layout(shape, four) for four in counted(step, list(sets))]
     return [one for one in every if one is not None]
 
 

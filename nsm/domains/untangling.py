@@ -21,6 +21,10 @@ from nsm.surfaces import topology
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
+# evaluations of a triangle's energy: so many for each triangle of the mesh, and the least allowed.
+# Meshes of which every second triangle is flipped at random take a fifth of it
+_WORK, _LEAST_WORK = 1000, 3_000_000
+_SMALL = 300  # triangles: an evaluation of fewer takes as long
 # of the area that a triangle should have: smaller ones could flip by rounding
 _ROOM = 1e-6
 # of the distance of two boundary neighbours before the map: the least after it
@@ -75,16 +79,18 @@ def untangled(
 
     Returns:
         (V, 2): ``image``, except for vertices near a flip, which follow the local affine map as
-        closely as possible. The caller counts flips that remain.
+        closely as possible. The caller counts flips that remain: some do where a bounded number of
+        evaluations is spent.
     """
     image = np.array(image, dtype=np.float64)
     copies = Copies.none(len(image)) if copies is None else copies
     joined = copies.first[faces]  # the triangles with each vertex by one number
     held = np.zeros(len(image), dtype=bool)
     held[copies.first[fixed]] = True
+    work = max(_WORK * len(faces), _LEAST_WORK)
     for rings in _RINGS:
         bad = flipped(image, faces)
-        if not bad.any():
+        if not bad.any() or work <= 0:
             break
         near = np.zeros(len(image), dtype=bool)
         near[joined[bad]] = True
@@ -93,7 +99,8 @@ def untangled(
         free = near & ~held
         patches = _patches(joined, free, bad)
         for patch in counted(f"{int(bad.sum())} flips, {rings} rings around each", patches):
-            _solve(rest, faces[patch], image, free, copies)
+            if work > 0:
+                work -= _solve(rest, faces[patch], image, free, copies, work)
         if near[joined].all():
             break
     return image
@@ -112,18 +119,24 @@ def _patches(faces: np.ndarray, free: np.ndarray, bad: np.ndarray) -> list[np.nd
 
 
 def _solve(
-    rest: np.ndarray, faces: np.ndarray, image: np.ndarray, free: np.ndarray, copies: Copies
-) -> None:
-    """Move free vertices of a patch (P, 3) in ``image``, if that leaves no flip in the patch."""
+    rest: np.ndarray,
+    faces: np.ndarray,
+    image: np.ndarray,
+    free: np.ndarray,
+    copies: Copies,
+    work: int,
+) -> int:
+    """Move free vertices of a patch (P, 3) in ``image``, if that leaves no flip in the patch, and
+    say how many evaluations of a triangle it took, of ``work`` or few more."""
     vertices, number = topology.renumbered(faces, len(image))
     faces = number[faces]
     affine = _affine_fit(_sides(rest[vertices], faces), _sides(image[vertices], faces))
     if affine is None:
-        return
+        return 0
     shape = rest[vertices] @ affine.T
     area = signed_areas(shape, faces)
     if not (area > 0).all():
-        return
+        return 0
     inverse = _cofactors(_sides(shape, faces)).transpose(0, 2, 1) / (2 * area[:, None, None])
     mobile = np.flatnonzero(free[copies.first[vertices]])
     moving, which = np.unique(copies.first[vertices[mobile]], return_inverse=True)
@@ -137,7 +150,10 @@ def _solve(
         return signed_areas(trial, faces) / area
 
     least, x = determinants().min(), image[moving]
+    size, spent = max(len(faces), _SMALL), 0
     for _ in range(_ROUNDS):
+        if spent >= work:
+            break
         # Escobar et al. 2003: enough smoothing to pull at the worst, and less as it gets better
         epsilon = np.sqrt(1e-12 + 0.04 * min(least, 0.0) ** 2)
 
@@ -153,17 +169,23 @@ def _solve(
             x.ravel(),
             jac=True,
             method="L-BFGS-B",
-            options={"maxiter": _ITERATIONS, "maxcor": 20},
+            options={
+                "maxiter": _ITERATIONS,
+                "maxcor": 20,
+                "maxfun": 1 + (work - spent) // size,
+            },
         )
+        spent += size * int(found.nfev)
         if not np.isfinite(found.x).all():
-            return
+            break
         x = copies.rounded(found.x.reshape(-1, 2))
         place(x)
         least = determinants().min()
         if least > _ROOM and not flipped(trial, faces).any():
             image[moving] = x
             image[vertices] = trial
-            return
+            break
+    return spent
 
 
 def _affine_fit(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytorch_lightning as pl
@@ -24,8 +25,9 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
 
     Triangles that the network flips are turned back on the mesh; where that is not enough, the
     training goes on with stronger terms for a bounded number of rounds, and the mesh is repaired
-    again. The result with the fewest faults is returned, the first of equal ones. A free boundary
-    that overlaps itself is reported: no term of the training acts on it.
+    again, as long as that leaves fewer faults than before. The result with the fewest faults is
+    returned, the first of equal ones. A free boundary that overlaps itself is reported: no term of
+    the training acts on it.
 
     Args:
         task: with ``certification.repair`` and ``certification.rounds`` in its settings.
@@ -40,13 +42,21 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
     task.trained = best = result = task.make_result(module)
     before = result.certificate
     rounds = 0
+    least = math.inf
     while settings.repair and not best.certificate["certified"]:
         result = result.repaired()
         best = min(best, result, key=_faults)
         if not _trainable(best) or rounds >= settings.rounds:
             break
+        if _faults(best) >= least:
+            say(f"{verdict(best.certificate)}, as before: no further training", soft_wrap=True)
+            break
+        least = _faults(best)
         rounds += 1
-        say(f"{verdict(best.certificate)}; going on with stronger terms")
+        say(
+            f"{verdict(best.certificate)}; going on with stronger terms, "
+            f"{rounds} of {settings.rounds} times at most"
+        )
         try:
             _train_on(task, module, data)
         except NsmError as error:  # the loss stays infinite

@@ -20,6 +20,7 @@ from nsm.domains.orbifold.collection_alignment import alignments_to_first, disag
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated
 from nsm.pipeline.collection_inputs import collected
+from nsm.pipeline.configured_surface import configured_repairs
 from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_landmarks
 from nsm.pipeline.landmark_inputs import name_of
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
@@ -49,7 +50,7 @@ from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, export_ply, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
-from nsm.stages import at, counted, stage
+from nsm.stages import counted, done_in_turn, stage
 from nsm.surfaces.landmark_lookup import files_beside
 from nsm.tasks import CollectionMap
 from nsm.tasks.initial_rotation import (
@@ -115,7 +116,8 @@ class CollectionMapTask(Task):
             self.console,
             template=self.has_template,
         )
-        self.check = check_landmarks(shapes, ids, self.console)
+        repairs = configured_repairs(self.config)
+        self.check = check_landmarks(shapes, ids, self.console, repairs, self.proposed)
         draw = partial(draw_landmarks, self.folder, landmarks=ids)
         self.use(neural_surfaces(self.config, shapes, ids, self.console, draw), ids)
 
@@ -290,13 +292,12 @@ class CollectionMapTask(Task):
             (folder / "landmarks.json").write_text(self.proposed.to_json(), encoding="utf-8")
 
     def write_artefacts(self, folder: Path, result: SurfaceCollection) -> None:
-        for name, draw in (
-            ("figures.png", figures_picture),
-            ("transfer.png", transfer_matrix_picture),
-            ("cycle.png", cycle_picture),
-        ):
-            at(name)
-            draw(folder / name, result)
+        draws = {
+            "figures.png": figures_picture,
+            "transfer.png": transfer_matrix_picture,
+            "cycle.png": cycle_picture,
+        }
+        done_in_turn("pictures", {n: partial(d, folder / n, result) for n, d in draws.items()})
         names = [re.sub(r"[/\\]", "_", name) for name in result.names]
         pairs = list(itertools.permutations(range(len(result)), 2))
         kept = [ends for ends in pairs if 0 in ends or not self.has_template]

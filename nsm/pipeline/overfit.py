@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from nsm.results import (
 )
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
+from nsm.stages import done_in_turn
 from nsm.tasks import Overfit
 from nsm.tasks.least_squares import fit_linear_skip
 
@@ -86,8 +88,12 @@ class OverfitTask(Task):
 
     def write_artefacts(self, folder: Path, result: NeuralSurface) -> None:
         vertices = result(result.surface.uv)
-        for ending in (".obj", ".glb"):
-            file = folder / f"reconstruction{ending}"
-            export_surface(file, vertices, result.surface, result.surface.uv)
-        error_picture(folder / "error.png", result.surface, result)
-        checkerboard_picture(folder / "checkerboard.png", result.surface, result)
+        surface = result.surface
+
+        def meshes() -> None:
+            for ending in (".obj", ".glb"):
+                export_surface(folder / f"reconstruction{ending}", vertices, surface, surface.uv)
+
+        pictures = {"error.png": error_picture, "checkerboard.png": checkerboard_picture}
+        drawn = {n: partial(d, folder / n, surface, result) for n, d in pictures.items()}
+        done_in_turn("files", {"reconstruction": meshes, **drawn})

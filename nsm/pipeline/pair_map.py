@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
 from nsm.results.pair_metrics import start_figures
 from nsm.results.pair_pictures import normals_picture
-from nsm.stages import at, stage
+from nsm.stages import done_in_turn, stage
 from nsm.surfaces.topology import face_areas
 from nsm.tasks import PairMap
 from nsm.tasks.initial_rotation import (
@@ -109,9 +109,9 @@ class PairMapTask(Task):
         shapes, ids, self.proposed = given_or_proposed(
             landmarks, shapes, self.domain, self.config, self.console, exact=not of_files
         )
-        self.check = check_landmarks(shapes, ids, self.console)
-        self.attributes = read_attributes(settings["attributes"], counts)
         repairs = configured_repairs(self.config)
+        self.check = check_landmarks(shapes, ids, self.console, repairs, self.proposed)
+        self.attributes = read_attributes(settings["attributes"], counts)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
         draw = partial(draw_landmarks, self.folder, landmarks=ids)
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw)
@@ -310,30 +310,40 @@ class PairMapTask(Task):
                 self.console.print(line, soft_wrap=True)
 
     def write_artefacts(self, folder: Path, result: SurfaceMap) -> None:
-        f, s, t = result, self.surface, self.psi.surface
-        _write_image(folder, f)
-        carried = np.where(f.unreached[:, None], np.nan, f.source_uv)
-        meshes = {
-            "target_with_source_uv": (f.target.in_original_units(t.vertices), t, carried),
-            "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
+        f = result
+
+        def reliability() -> None:
+            write_reliability(folder / "reliability.ply", f)
+            reliability_picture(folder / "reliability.png", f)
+
+        def morph() -> None:
+            _write_morph(folder, f, self.console)
+            morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+
+        works: dict[str, Callable[[], object]] = {
+            "mapped": lambda: _write_image(folder, f),
+            "textured meshes": lambda: _write_with_uv(folder, f),
+            "correspondences.npz": lambda: write_correspondences(folder / "correspondences.npz", f),
+            "reliability": reliability,
+            "transfer.png": lambda: transfer_picture(folder / "transfer.png", f),
+            "distortion.png": lambda: distortion_picture(folder / "distortion.png", f),
         }
-        for name, mesh in meshes.items():
-            at(name)
-            for ending in (".obj", ".glb"):
-                export_surface(folder / f"{name}{ending}", *mesh)
-        write_correspondences(folder / "correspondences.npz", f)
-        at("reliability")
-        write_reliability(folder / "reliability.ply", f)
-        reliability_picture(folder / "reliability.png", f)
-        at("transfer.png")
-        transfer_picture(folder / "transfer.png", f)
-        at("distortion.png")
-        distortion_picture(folder / "distortion.png", f)
         if isinstance(f.target.map, AnalyticSurface):
-            normals_picture(folder / "normals.png", f)
-        at("morph")
-        _write_morph(folder, f, self.console)
-        morph_pictures(folder / "morph.png", folder / "morph.gif", f)
+            works["normals.png"] = lambda: normals_picture(folder / "normals.png", f)
+        done_in_turn("files", {**works, "morph": morph})
+
+
+def _write_with_uv(folder: Path, f: SurfaceMap) -> None:
+    """Each surface with the other one's coordinates in Ω."""
+    s, t = f.source.surface, f.target.surface
+    carried = np.where(f.unreached[:, None], np.nan, f.source_uv)
+    meshes = {
+        "target_with_source_uv": (f.target.in_original_units(t.vertices), t, carried),
+        "source_with_target_uv": (f.source.in_original_units(s.vertices), s, f.image_uv),
+    }
+    for name, mesh in meshes.items():
+        for ending in (".obj", ".glb"):
+            export_surface(folder / f"{name}{ending}", *mesh)
 
 
 def _write_morph(folder: Path, f: SurfaceMap, console: Console) -> None:

@@ -21,6 +21,12 @@ PHI = (
 )
 
 
+@pytest.fixture(autouse=True)
+def no_coarse_maps(monkeypatch):
+    """Distances alone; tests/correspondence/test_coarse_check.py has the coarse maps."""
+    monkeypatch.setattr("nsm.pipeline.landmark_check.coarse_check", lambda *_: None)
+
+
 def pair(meshes, landmarks):
     """The agreement of two meshes."""
     found = agreement(meshes, landmarks)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from thorough import examples
 
-from nsm.domains import domain
+from nsm.domains import domain, untangling
 from nsm.domains.planar_mesh import flipped, order_violations
 from nsm.domains.untangling import untangled
 from nsm.surfaces.predicates import orientation
@@ -95,6 +95,28 @@ def test_only_what_lies_around_a_flip_is_moved():
 def test_a_mesh_without_flips_is_left_alone():
     image = DISC @ np.array([[0.8, 0.3], [-0.1, 1.2]])
     assert (untangled(DISC, DISC_FACES, image, rim_of(DISC, DISC_FACES)) == image).all()
+
+
+def test_the_work_is_bounded(monkeypatch):
+    """A rim turned inside out can never be untangled: what is evaluated stays within the bound."""
+    spent = []
+    of_energy = untangling._energy
+
+    def counted(points, faces, inverse, epsilon):
+        spent.append(max(len(faces), untangling._SMALL))
+        return of_energy(points, faces, inverse, epsilon)
+
+    monkeypatch.setattr(untangling, "_energy", counted)
+    monkeypatch.setattr(untangling, "_LEAST_WORK", 0)
+    monkeypatch.setattr(untangling, "_WORK", 20)
+    rim = rim_of(DISC, DISC_FACES)
+    image = DISC.copy()
+    image[~rim] = np.random.default_rng(0).permutation(image[~rim])
+    image[np.flatnonzero(rim)[:2]] = image[np.flatnonzero(rim)[1::-1]]  # two of the rim exchanged
+    left = flipped(untangled(DISC, DISC_FACES, image, rim), DISC_FACES)
+    assert left.any()
+    whole = 20 * len(DISC_FACES)
+    assert 0.9 * whole < sum(spent) < whole + 25 * max(spent)
 
 
 def test_what_cannot_be_untangled_is_given_back_for_the_caller_to_count():

@@ -117,6 +117,13 @@ def test_the_best_round_is_returned_not_the_last(trainings):
     assert figures["before_repair"]["flipped_triangles"] == 9
 
 
+def test_a_round_that_leaves_as_many_faults_is_the_last(trainings):
+    task = Scripted(Found(9, mended=2), Found(8, mended=1), Found(0), rounds=4)
+    best, figures = certification.certified(task, None, None)
+    assert best.flips == 7 and not figures["certified"]
+    assert figures["rounds"] == len(trainings) == 1 and len(task.results) == 1
+
+
 def test_a_boundary_that_overlaps_itself_spends_no_rounds(trainings):
     best, figures = certification.certified(Scripted(Found(2, overlaps=3, mended=2)), None, None)
     assert (best.flips, best.overlaps) == (0, 3) and not figures["certified"]
