@@ -56,11 +56,11 @@ bench-baselines: .venv/.nsm-dev
 bench-closed: .venv/.nsm-dev
 	$(BIN)/python benchmarks/closed_surfaces.py $(if $(MESHES),--meshes $(MESHES))
 
-# Correspondences with no landmarks or few, errors at annotated ones, beside peers (nsm[peers]): an
-# hour and a half, or EVERY=6. It goes on where it stopped. MESHES as above.
+# Correspondences with no landmarks or few, errors at annotated ones, beside peers (nsm[peers]).
+# Some hours, or PAIRS=12 of the animals. It goes on where it stopped. MESHES as above.
 bench-correspondence: .venv/.nsm-dev
 	$(BIN)/python benchmarks/correspondence.py $(if $(MESHES),--meshes $(MESHES)) \
-	  $(if $(EVERY),--every $(EVERY))
+	  $(if $(PAIRS),--pairs $(PAIRS))
 
 # Pieces cut from shapes, mapped into the whole ones and into others: half an hour. It goes on where
 # it stopped. MESHES as above.

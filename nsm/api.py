@@ -231,6 +231,14 @@ class _Request:
             name, _, text = setting.partition("=")
             check_override(name, text)
         for key, value in settings.items():
+            if key in known_keys() and "." in key:
+                group, _, rest = key.partition(".")
+                raise NsmError(
+                    f"{key}: no argument has a dot; give {group}={{{rest!r}: ...}}, or "
+                    f'overrides=["{key}=..."]',
+                    kind="unknown_setting",
+                    key=key,
+                )
             if key not in known:
                 raise unknown_setting(key)
             if value is None or isinstance(value, str) and (conf_folder() / key).is_dir():

@@ -287,7 +287,9 @@ def _place(error: BaseException) -> str:
             place = f"{frame.filename}:{frame.lineno}"
             if frame.filename.startswith(ours):
                 own = place
-            elif not frame.filename.startswith((*libraries, "<", sys.prefix)):
+            elif frame.filename.startswith((*libraries, "<", sys.prefix)):
+                continue
+            elif os.path.isfile(frame.filename):  # not of a library in C, which calls ours
                 return place
         link = link.__cause__ or link.__context__
     return "" if isinstance(error, NsmError) else own

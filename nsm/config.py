@@ -243,7 +243,12 @@ def unknown_setting(key: str, known: Sequence[str] | None = None, what: str = ""
     if known is None:
         from nsm.help import known_keys
 
+        last = key.rpartition(".")[2]
+        same = [one for one in known_keys() if "." in one and one.rpartition(".")[2] == last]
+        # a name that one group alone has: the group is what is wrong
         hint = nearest(key, known_keys(), "see nsm --help")
+        if "." in key and len(same) == 1:
+            hint = f"did you mean {same[0]!r}?"
     else:
         hint = nearest(key.rpartition(".")[2], known, "" if known else f"{what or 'it'} has none")
     message = f"{what} has no such setting" if what else "no such setting"

@@ -312,6 +312,7 @@ def test_a_mistake_names_the_nearest():
         ("activation=sillu", "silu"),
         ("optimizer._target_=torch.optim.Nadam", "torch.optim.NAdam"),
         ("trainer.acelerator=gpu", "accelerator"),
+        ("landmarks.strict=true", "proposal.strict"),
     ):
         with pytest.raises(NsmError) as error:
             compose_config([override])
@@ -583,6 +584,7 @@ class TestFunctions:
             ([], {"activaton": "silu"}, "unknown_setting", "activaton"),
             ([], {"activation": "sillu"}, "unknown_option", "activation"),
             ([], {"trainer": {"max_step": 3}}, "unknown_setting", "trainer.max_step"),
+            ([], {"trainer.max_steps": 3}, "unknown_setting", "trainer.max_steps"),
             ([], {"trainer": 3}, "wrong_type", "trainer"),
             ([], {"seed": "many"}, "wrong_type", "seed"),
             (["seed=1"], {"seed": 2}, "conflicting_settings", "seed"),

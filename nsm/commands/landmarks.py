@@ -7,11 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from rich.console import Console
+
 from nsm.arguments import Arguments
 from nsm.commands import add_address
 from nsm.errors import NsmError
 from nsm.loading_libraries import loading_libraries
 from nsm.optional_dependencies import needed
+from nsm.stages import stage
 
 if TYPE_CHECKING:
     from nsm.correspondence.landmark_list import LandmarkList
@@ -148,9 +151,13 @@ def _start(shapes: Sequence[EditedShape], file: Path | None, empty: bool) -> Lan
         return LandmarkList(count)
     from nsm.correspondence import proposed_for_all
 
+    console = Console(highlight=False)
     try:
-        found = proposed_for_all([(s.vertices, s.faces) for s in shapes]).vertices[0]
+        with stage(console, f"proposing landmarks of {', '.join(shape.name for shape in shapes)}"):
+            found = proposed_for_all([(s.vertices, s.faces) for s in shapes])
     except NsmError as error:
-        print(f"begins without landmarks: {error}", flush=True)
+        console.print(f"begins without landmarks: {error}", soft_wrap=True, markup=False)
         return LandmarkList(count)
-    return LandmarkList(count, list(found.T))
+    sure = "sure" if found.sure else "NOT SURE, check each"
+    console.print(f"{len(found.vertices[0])} landmarks proposed, {sure}")
+    return LandmarkList(count, list(found.vertices[0].T))

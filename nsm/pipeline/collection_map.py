@@ -246,7 +246,8 @@ class CollectionMapTask(Task):
     def measure(self, result: SurfaceCollection) -> None:
         points = self.points.double().numpy()
         result.metrics.update(collection_metrics(result, points, self.matched.points))
-        result.metrics.update({} if self.check is None else self.check.figures)
+        for known in (self.proposed, self.check):
+            result.metrics.update({} if known is None else known.figures)
         for (i, j), name in result.pair_names.items():
             figures = result.metrics["pairs"][name]
             source, target = self.phis[i].surface, self.phis[j].surface
@@ -262,6 +263,7 @@ class CollectionMapTask(Task):
     def warnings(self, result: SurfaceCollection) -> list[Text]:
         pairs = result.metrics["pairs"]
         found = (
+            None if self.proposed is None else self.proposed.warning,
             None if self.check is None else self.check.warning,
             warning_of_distortion(pairs),
             warning_of_missed_landmarks(pairs),

@@ -248,7 +248,8 @@ class PairMapTask(Task):
         source, target = self.surface, self.psi.surface
         result.metrics.update(pair_metrics(source, target, result.image_uv, landed, targets))
         result.metrics.update(result.certificate)
-        result.metrics.update({} if self.check is None else self.check.figures)
+        for known in (self.proposed, self.check):
+            result.metrics.update({} if known is None else known.figures)
         if self.trained is not None:
             before = flipped_percent(self.trained.image_uv[source.of_part], source.part.faces)
             result.metrics["flipped_before_repair_percent"] = before
@@ -260,6 +261,7 @@ class PairMapTask(Task):
     def warnings(self, result: SurfaceMap) -> list[Text]:
         name = f"{self.surface.name} → {self.psi.surface.name}"
         found = (
+            None if self.proposed is None else self.proposed.warning,
             None if self.check is None else self.check.warning,
             warning_of_distortion({name: result.metrics}),
             warning_of_missed_landmarks({name: result.metrics}),

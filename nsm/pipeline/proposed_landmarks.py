@@ -37,7 +37,7 @@ class ProposedLandmarks:
         vertices: of each hypothesis (L, k), best first; the given landmarks before the others.
         scores: of each; lower is better.
         margin: how far the first is ahead, in log energy.
-        sure: whether that is enough.
+        sure: whether that is enough; an alternative is never sure.
         given: how many landmarks were given.
         chosen: the number of the hypothesis that is taken.
         places: of each mesh the faces (F, 3) of its file and the places (G, 4) of given landmarks,
@@ -90,13 +90,29 @@ class ProposedLandmarks:
     def said(self) -> str:
         """What was given, what is proposed, and how sure that is."""
         kept = f"{self.given} given are kept, " if self.given else ""
-        ahead = (
-            f"{self.margin:.3f} ahead of the next different map, in log energy"
-            if np.isfinite(self.margin)
-            else "no different map among the best"
-        )
+        if self.chosen:
+            behind = self.scores[self.chosen] - self.scores[0]
+            ahead = f"alternative {self.chosen}, {behind:.3f} behind the best map, in log energy"
+        elif np.isfinite(self.margin):
+            ahead = f"{self.margin:.3f} ahead of the next different map, in log energy"
+        else:
+            ahead = "no different map among the best"
         sure = "sure" if self.sure else "NOT SURE"
         return f"landmarks: {kept}{self.added} proposed, {sure}: {ahead}"
+
+    @property
+    def figures(self) -> dict[str, bool]:
+        """Of a map's ``metrics``: whether the landmarks are sure."""
+        return {"landmarks_sure": self.sure}
+
+    @property
+    def warning(self) -> Text | None:
+        """One line for landmarks that are not sure; None for others."""
+        if self.sure:
+            return None
+        other = 0 if self.chosen else 1
+        advice = f"check landmarks.json of the run, or try proposal.alternative={other}"
+        return Text(f"WARNING: {self.said}; {advice}", style="yellow")
 
 
 def given_or_proposed(
@@ -190,11 +206,7 @@ def given_or_proposed(
             kind="unsure_landmarks",
             key="proposal.strict",
         )
-    if found.sure:
-        console.print(found.said, soft_wrap=True)
-    else:
-        advice = "check landmarks.json of the run, or try proposal.alternative=1"
-        console.print(Text(f"WARNING: {found.said}; {advice}", style="yellow"), soft_wrap=True)
+    console.print(found.said if found.warning is None else found.warning, soft_wrap=True)
     return list(shapes), found.landmarks, replace(found, places=known)
 
 
@@ -231,7 +243,9 @@ def _proposal(
     numbers = [one[(one >= 0).all(axis=1)] for one in numbers]
     for one in numbers:  # a vertex that was merged with another keeps its number
         one[: len(ids[0])] = np.stack(ids, axis=1)
-    return ProposedLandmarks(numbers, scores, margin, sure, len(ids[0]), alternative)
+    return ProposedLandmarks(
+        numbers, scores, margin, sure and not alternative, len(ids[0]), alternative
+    )
 
 
 def _named(lists: Sequence[np.ndarray]) -> dict[str, Any]:

@@ -222,6 +222,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "cycle_error_max_percent": ("cycle error, largest", "% of diagonal"),
     "certified": ("certified injective", ""),
     "landmarks_doubtful": ("landmarks doubtful", ""),
+    "landmarks_sure": ("proposed landmarks sure", ""),
     "steps": ("steps", ""),
     "seconds": ("time", "s"),
 }

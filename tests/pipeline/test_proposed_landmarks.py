@@ -1,5 +1,6 @@
 """landmarks=auto: what is said, written and refused, with a proposal that is known."""
 
+import json
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -66,6 +67,7 @@ def test_a_sure_proposal_is_taken_in_the_numbers_of_the_files(monkeypatch, tmp_p
     # the second file has a vertex more in front
     assert ids == [[0, 1, 2, 3], [11, 12, 13, 14]]
     assert "WARNING" not in said and "0.500" in said
+    assert found.warning is None and found.figures == {"landmarks_sure": True}
     (tmp_path / "landmarks.json").write_text(found.to_json())
     assert list(read_pairs(tmp_path / "landmarks.json")) == ids
 
@@ -84,6 +86,9 @@ def test_the_second_best_is_one_flag_away(monkeypatch):
     ids, found, _ = proposed_with(0.01, monkeypatch, "proposal.alternative=1")
     assert ids[0] == [20, 21, 22, 23]
     assert '"source": [0, 1, 2, 3]' in found.to_json()  # the best is kept among alternatives
+    _, second, said = proposed_with(0.5, monkeypatch, "proposal.alternative=1")
+    assert second.figures == {"landmarks_sure": False}  # however sure the best is
+    assert second.warning.plain in said and "proposal.alternative=0" in said
     with pytest.raises(NsmError) as refused:
         proposed_with(0.01, monkeypatch, "proposal.alternative=2")
     assert (refused.value.kind, refused.value.key) == ("out_of_range", "proposal.alternative")
@@ -235,7 +240,10 @@ def test_the_command_trains_with_them_and_leaves_the_file(here, tmp_path, monkey
     assert not (tmp_path / "run").exists()
     run = here(*words)
     assert run.returncode == 0, run.stderr
-    assert "WARNING" in run.stdout
+    kept = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    warnings = [line for line in kept["warnings"] if "NOT SURE" in line]
+    assert len(warnings) == 1 and kept["metrics"]["landmarks_sure"] is False
+    assert run.stdout.count(warnings[0]) == 2  # before the training, and after the figures
     source, target = read_pairs(tmp_path / "run" / "landmarks.json")
     assert (source, target) == ([0, 1, 2, 3], [10, 11, 12, 13])
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from nsm.correspondence import CollectionProposal
 from nsm.correspondence.landmark_list import LandmarkList
 from nsm.correspondence.preview import previewed
 from nsm.errors import NsmError
@@ -158,6 +159,13 @@ def test_the_command_begins_with_a_file_and_ends_without_an_error(
     assert vertices(made[0]) == [(3, 6), (5, 8)]
     run = here("landmarks", "a.obj", "b.obj", "b.obj", "--empty", "--port", "0")
     assert run.returncode == 130 and vertices(made[1]) == []
+    found = CollectionProposal([np.array([[3, 6], [5, 8]])], [2.0], 0.1, 0, False)
+    monkeypatch.setattr("nsm.correspondence.proposed_for_all", lambda _: found)
+    run = here("landmarks", "a.obj", "b.obj", "--port", "0")
+    assert run.stdout.startswith("2 landmarks proposed, NOT SURE") and vertices(made[2]) == [
+        (3, 6),
+        (5, 8),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from thorough import examples
 
+from nsm.cli import _place
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.landmark_inputs import landmark_vertices
@@ -89,6 +90,9 @@ def test_each_fault_names_file_and_line(tmp_path, name, text, kind, line):
         read_landmarks(tmp_path / name)
     assert refused.value.kind == kind and refused.value.key.startswith(str(tmp_path / name))
     assert line in str(refused.value) and "\n" not in str(refused.value)
+    # of the frames below this test, none is told as the user's own
+    found = refused.value.with_traceback(refused.value.__traceback__.tb_next)
+    assert _place(found) == ""
 
 
 @examples(30)

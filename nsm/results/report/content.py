@@ -30,6 +30,7 @@ _BEST = {
     "certified": "none",
     "landmark_correlation": "none",
     "landmarks_doubtful": "none",
+    "landmarks_sure": "none",
 }  # of the figures for which it is not the lowest value
 
 
