@@ -169,11 +169,10 @@ def test_groups_can_be_changed_separately():
     )
     assert (config.data.points[0], config.sampler.pool) == (2048, 500_000)
     assert config.domain._target_ == "nsm.domains.Square"
-    config = compose_config(["task=pair_map", "constraints=fast_pair_map", "loss_weights=adam_pair_map"])
+    own = ["constraints=fast_pair_map", "loss_weights=adam_pair_map"]
+    config = compose_config(["task=pair_map", *own])
     assert (config.constraints.multiplier_every, config.loss_weights.seam) == (1, 1e3)
-    config = compose_config(
-        ["task=pair_map", "experiment=paper", "constraints=fast_pair_map", "loss_weights=adam_pair_map"]
-    )
+    config = compose_config(["task=pair_map", "experiment=paper", *own])
     assert (config.constraints.multiplier_every, config.map.width) == (1, 128)
 
 

@@ -20,7 +20,8 @@ QUICK = ["experiment=quick", "data.held_out=512", "trainer.threads=1"]
 
 CROSSED = [[0.5, 0.0], [-0.5, 0.1], [0.0, 0.5], [0.1, -0.6]]  # swapped in pairs: a half turn inside
 # the settings of experiment=adam beside experiment=quick
-FORCED = ["map=planar", "encoding=planar_grid", "optimizer=adam_planar", "constraints=adam_pair_map"]
+FORCED = ["map=planar", "encoding=planar_grid", "optimizer=adam_planar"]
+FORCED += ["constraints=adam_pair_map", "loss_weights=adam_pair_map"]
 FORCED += ["encoding.resolutions=[16,64]", "sampler=fresh", "trainer.tabulated=null"]
 FORCED += ["constraints.ramp=0", "loss_weights.triangles=0", "loss_weights.seam=0"]
 FORCED += ["loss_weights.injectivity=0", "loss_weights.landmarks=1.0e+4"]

@@ -30,7 +30,7 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 def barrier_of(image, step=1):
     barrier = BoundaryBarrier(torch.as_tensor(SQUARE), FACES)
-    loop = np.array([np.flatnonzero((SQUARE == p).all(axis=1))[0] for p in barrier.uv.numpy()])
+    loop = np.array([np.flatnonzero((p == SQUARE).all(axis=1))[0] for p in barrier.uv.numpy()])
     assert barrier(Moved(SQUARE[loop]), 0).item() == 0  # far apart
     h = Moved(np.asarray(image, dtype=float)[loop])
     return barrier, h, barrier(h, step)
