@@ -59,6 +59,7 @@ OTHERS = {
 WRONG = 0.15  # a map with a larger mean error
 SHARES = (0.05, 0.1, 0.25)
 GIVEN = (1, 2, 3, 4, 5, 8)
+PEERS = {"zoomout": zoomout_map, "icp": icp_map}
 
 
 class Annotated(NamedTuple):
@@ -165,8 +166,7 @@ ROWS: dict[str, Row] = {
     "none, full map": full_map,
     "given 5, full map": partial(full_map, given=5),
     "given 8, full map": partial(full_map, given=8),
-    "zoomout": partial(peer, method=zoomout_map),
-    "icp": partial(peer, method=icp_map),
+    **{name: partial(peer, method=method) for name, method in PEERS.items()},
 }
 
 
@@ -224,7 +224,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(6, 4))
+    figure, axes = plt.subplots(figsize=(8, 4))
     for row in rows_of(lines):
         chosen = [
             line["errors"] for line in lines if (line["row"], line["kind"]) == (row, "animals")
@@ -232,10 +232,11 @@ def draw(lines: list[dict[str, Any]]) -> None:
         if chosen:
             every = np.sort(np.concatenate([np.array(e) for e in chosen]))
             share = 100 * np.arange(1, len(every) + 1) / len(every)
-            axes.plot(every, share, label=f"{row}, {len(chosen)} pairs")
+            style = "--" if "full map" in row else ":" if row in PEERS else "-"
+            axes.plot(every, share, style, label=f"{row}, {len(chosen)} pairs")
     axes.set(xlim=(0, 0.3), ylim=(0, 100), xlabel="geodesic error / √area", ylabel="landmarks, %")
     axes.grid(alpha=0.3)
-    axes.legend(loc="center right", bbox_to_anchor=(1, 0.64), fontsize=8)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8)
     figure.tight_layout()
     figure.savefig(PICTURE, dpi=120)
     plt.close(figure)
