@@ -212,7 +212,13 @@ def test_a_sweep_of_energies_is_for_every_map(task):
 
 @pytest.mark.parametrize("sweep", ["activation", "architecture"])
 @pytest.mark.parametrize(
-    "task", ["task=overfit", "task=param", "task=collection_map", "task=pair_map experiment=adam"]
+    "task",
+    [
+        "task=overfit",
+        "task=param experiment=adam",
+        "task=collection_map",
+        "task=pair_map experiment=adam",
+    ],
 )
 def test_sweeps_of_networks_train_networks_without_a_grid(sweep, task):
     config = compose_config([f"sweep={sweep}", *task.split()])

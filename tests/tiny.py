@@ -25,6 +25,8 @@ TRAINING = [
     "artefacts=false",
     "trainer.progress=false",
 ]
+# the same of a flattening, whose h is a spline
+FLATTENING = [word for word in TRAINING if not word.startswith("encoding")]
 # of maps in the tests: short, and of few samples
 QUICK = [
     "experiment=quick",

@@ -8,7 +8,7 @@ import networkx
 import numpy as np
 import pytest
 import trimesh
-from tiny import TRAINING
+from tiny import FLATTENING, TRAINING
 
 import nsm
 from nsm.errors import NsmError
@@ -21,8 +21,8 @@ from nsm.surfaces.loading import load_mesh
 from nsm.surfaces.location import Places
 
 OWN = ("surface.path", "trainer.progress", "artefacts")
-TINY = [word for word in TRAINING if not word.startswith(OWN)]
-OF_PHI = [word for word in TINY if not word.startswith("surface")]
+TINY = [word for word in FLATTENING if not word.startswith(OWN)]
+OF_PHI = [word for word in TRAINING if not word.startswith((*OWN, "surface"))]
 WORDS = [*TINY, "phi.overrides=[" + ",".join(f"'{word}'" for word in OF_PHI) + "]"]
 
 

@@ -145,23 +145,19 @@ def test_libigl_flattens_a_bent_sheet_isometrically(name):
 
 
 HEMISPHERE = shapes.hemisphere(10)
-LITTLE = [
-    "data.batch_size=512",
-    "data.held_out=512",
-    "data.steps_per_epoch=50",
-    "encoding.resolutions=[4,16]",
-]
+LITTLE = ["data.batch_size=512", "data.held_out=512"]
+OF_PHI = ["data.steps_per_epoch=50", "encoding.resolutions=[4,16]", "trainer.max_steps=100"]
 
 
 @pytest.fixture(scope="module")
 def phi() -> nsm.NeuralSurface:
     # from Tutte's embedding, as SLIM on the disc leaves hardly anything to lower
     surface = Surface.from_arrays(*HEMISPHERE, name="hemisphere", parameterization="tutte")
-    overrides = ["experiment=quick", *LITTLE, "trainer.max_steps=100"]
+    overrides = ["experiment=quick", *LITTLE, *OF_PHI]
     return nsm.overfit(surface, overrides=overrides, progress=False)
 
 
-QUICK = [*LITTLE, "trainer.max_steps=200"]
+QUICK = [*LITTLE, "map.cells=32", "optimizer.levels=[8,32]", "optimizer.steps=[2]"]
 
 
 def test_parameterize_lowers_distortion_and_is_given_back(phi, tmp_path):
