@@ -85,7 +85,7 @@ def config_of(task: str, settings: str) -> DictConfig:
     overrides = [f"task={task}", "seed=0"]
     if settings == "paper":
         overrides += ["experiment=paper"]
-    elif task == "pair_map":  # the default has steps of two kinds
+    elif task in _SPLINES:
         overrides += ["experiment=adam"]
     return compose_config(overrides)
 
@@ -457,7 +457,7 @@ def batches(rounds: int) -> dict[str, Any]:
 def _named(key: str) -> str:
     """The task and settings of a step, as ``config_of`` takes them."""
     task, settings = key.split("/")
-    network = task == "pair_map" and settings == "default"
+    network = task in _SPLINES and settings == "default"
     return f"{task}, {'experiment=adam' if network else settings}"
 
 
@@ -478,9 +478,9 @@ def page(results: dict[str, Any]) -> str:
             "",
             "Loss and gradient, compared with a plain restatement of the published recipe (one "
             "`autograd.grad` per output, batched SVD and explicit inverse) for the same networks "
-            f"and batch. The collection has {SURFACES} surfaces. The pair map's default begins "
-            "with steps of Adam on a spline and ends with quasi-Newton steps, which the recipe has "
-            "no counterpart of: the network of `experiment=adam` takes its place.",
+            f"and batch. The collection has {SURFACES} surfaces. Flattening and pair maps take "
+            "quasi-Newton steps on a spline by default, which the recipe has no counterpart of: "
+            "the network of `experiment=adam` takes their place.",
             "",
             "| task, settings | published, ms | nsm, ms | speed-up |",
             "|---|---|---|---|",
@@ -599,6 +599,8 @@ def write_page() -> None:
     PAGE.write_text(page(json.loads((RESULTS / "speed.json").read_text())))
 
 
+# tasks whose default trains a spline, by steps that the recipe has no counterpart of
+_SPLINES = ("param", "pair_map")
 PARTS = ("costs", "peak", "growth", "batches", "memory", "times")
 
 

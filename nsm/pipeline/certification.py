@@ -26,8 +26,8 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
     Triangles that the network flips are turned back on the mesh; where that is not enough, the
     training goes on with stronger terms for a bounded number of rounds, and the mesh is repaired
     again, as long as that leaves fewer faults than before. The result with the fewest faults is
-    returned, the first of equal ones. A free boundary that overlaps itself is reported: no term of
-    the training acts on it.
+    returned, the first of equal ones. A free boundary that overlaps itself is reported: a
+    further training does not undo that.
 
     Args:
         task: with ``certification.repair`` and ``certification.rounds`` in its settings.

@@ -246,7 +246,12 @@ MAP_WORDS = ["data.batch_size=64", "data.held_out=64", "data.steps_per_epoch=4",
 MAP_WORDS += ["trainer.max_steps=20", "trainer.threads=1", "trainer.progress=false"]
 MAP_WORDS += ["artefacts=false"]
 NETWORK = ["map.width=8", "map.depth=1"]
-SPLINE = ["map.cells=8", "constraints.triangles_from=0.8"]  # ends in quasi-Newton steps
+SPLINES = {
+    # ends in quasi-Newton steps
+    "pair_map": ["map.cells=8", "constraints.triangles_from=0.8"],
+    # has no others, and may end before its last step
+    "param": ["map.cells=8", "optimizer.levels=[8]", "optimizer.steps=[]"],
+}
 
 
 def mapped(task, folder, resuming=False):
@@ -258,9 +263,7 @@ def mapped(task, folder, resuming=False):
             ["task=pair_map", "experiment=adam", *MAP_WORDS, *NETWORK, "encoding.resolutions=[8]"]
         )
     else:
-        config = compose_config(
-            [f"task={task}", *MAP_WORDS, *(SPLINE if task == "pair_map" else NETWORK)]
-        )
+        config = compose_config([f"task={task}", *MAP_WORDS, *SPLINES.get(task, NETWORK)])
     if task == "param":
         result = run_task(config, folder, Given(phi=phi), resuming=resuming)
         return {**result.map.state_dict(), "uv": torch.from_numpy(result.uv)}

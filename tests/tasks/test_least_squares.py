@@ -150,7 +150,7 @@ def test_too_few_features_are_refused():
 
 
 def test_maps_of_the_plane_have_nothing_to_fit():
-    settings = compose_config(["task=param", "map.linear_skip=fitted"])
+    settings = compose_config(["task=param", "experiment=adam", "map.linear_skip=fitted"])
     with pytest.raises(NsmError) as error:
         planar_map(None, settings.map, settings.activation, settings.encoding)
     assert error.value.key == "map.linear_skip"

@@ -51,7 +51,7 @@ def inputs(task, phis):
     [
         ("overfit", SMALL),
         ("overfit", ["experiment=paper", "map.width=8", "map.depth=2"]),
-        ("param", SMALL),
+        ("param", ["experiment=adam", *SMALL]),
         ("pair_map", ["map.cells=8"]),
         ("pair_map", ["experiment=adam", *SMALL]),
         # the watch on triangles looks for those that are nearest to folding, by numbers
