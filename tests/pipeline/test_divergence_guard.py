@@ -250,8 +250,9 @@ SPLINES = {
     # ends in quasi-Newton steps
     "pair_map": ["map.cells=8", "constraints.triangles_from=0.8"],
     # has no others, and may end before its last step
-    "param": ["map.cells=8", "optimizer.levels=[8]", "optimizer.steps=[]", "optimizer.iterations=2"],
+    "param": ["map.cells=8", "optimizer.levels=[8]", "optimizer.steps=[]"],
 }
+SPLINES["param"] += ["optimizer.iterations=2"]
 
 
 def mapped(task, folder, resuming=False):
