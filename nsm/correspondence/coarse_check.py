@@ -24,6 +24,7 @@ _SPREAD = 6  # landmarks among which the four at the cones are chosen
 _ROUND = Round(0, 5, 30)
 _EXCHANGED = 8  # landmarks at most of which two are exchanged: pairs are many
 _STRAINED = 10.0  # energy of a strained map: then the landmarks at the cones are left out, too
+_GOOD = 7.0  # energy below which the map needs no change, whatever distances between landmarks say
 # energies from which on landmarks are doubted as a whole; few are on like shapes met with less
 _FEW, _STRAINED_FEW, _STRAINED_MANY = 5, 16.0, 30.0
 # gains from which on a change is told. Measured, see docs/correspondence.md
@@ -71,6 +72,11 @@ class CoarseCheck:
         """The change that the shapes want most; None if none gains enough."""
         found = max(self.changes, key=lambda change: change.excess, default=None)
         return found if found is not None and found.excess > 0 else None
+
+    @property
+    def good(self) -> bool:
+        """Whether the map through all landmarks is as little distorted as those of like shapes."""
+        return self.energy < _GOOD and self.best is None
 
     @property
     def strained(self) -> bool:

@@ -56,12 +56,13 @@ class LandmarkCheck:
     def warning(self) -> Text | None:
         """One line in red, which names the landmark that fits least; None if there is no doubt.
 
-        Where distances hardly agree at all, one change of the landmarks is told only if it makes
-        a good coarse map.
+        Distances are not asked where good coarse maps meet all landmarks. Where they hardly agree,
+        one change of the landmarks is told only if it makes a good coarse map.
         """
         found, said = self.found, self._of_coarse_map()
         explained = any(one.explained for one in self.coarse.values())
-        if found is not None and found.doubtful:
+        met = len(self.coarse) == len(self.names) - 1 and all(c.good for c in self.coarse.values())
+        if found is not None and found.doubtful and not met:
             if said is None or (found.unrelated and not explained):
                 said = self._of_distances(found)
         if said is None:

@@ -5,7 +5,7 @@ import pytest
 from limbs import star
 from rich.console import Console
 
-from nsm.correspondence import CoarseCheck, coarse_check
+from nsm.correspondence import Agreement, CoarseCheck, CommonAgreement, coarse_check
 from nsm.domains.joint_preparation import Mesh
 from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks
 from nsm.surfaces.shapes import hemisphere
@@ -53,6 +53,16 @@ def test_a_map_that_no_change_helps_is_told_as_a_whole():
     assert "a coarse map of a to b" in check.warning.plain and "40.0" in check.warning.plain
     check = LandmarkCheck(["a", "b"], [TIPS, TIPS], None, {1: CoarseCheck(12.0, [], 4)})
     assert check.warning is None and not check.figures["landmarks_doubtful"]
+
+
+def test_distances_are_not_asked_where_a_good_map_meets_all():
+    found = CommonAgreement({(0, 1): Agreement(0.3, np.full(5, 0.1), np.full(5, 0.6))})
+    assert found.doubtful
+    said = [
+        LandmarkCheck(["a", "b"], [TIPS, TIPS], found, {1: CoarseCheck(energy, [], 5)}).warning
+        for energy in (5.0, 12.0)
+    ]
+    assert said[0] is None and "correlated" in said[1].plain
 
 
 def test_a_mirror_image_is_told():
