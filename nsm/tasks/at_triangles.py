@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor, nn
 
 from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
@@ -23,6 +25,10 @@ class AtTriangles(Training):
     quadrature: MeshQuadrature | None
     triangles_from: float
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.quadrature, self.triangles_from = None, math.inf
+
     def set_quadrature(
         self, share: float, max_steps: int, uv: Tensor, faces: Tensor, surface: nn.Module
     ) -> None:
@@ -33,7 +39,7 @@ class AtTriangles(Training):
             max_steps: their number.
             uv, faces, surface: see :class:`nsm.tasks.mesh_quadrature.MeshQuadrature`.
         """
-        self.quadrature, self.triangles_from = None, share * max_steps
+        self.triangles_from = share * max_steps
         if share < 1:
             self.quadrature = MeshQuadrature(uv, faces, surface)
 

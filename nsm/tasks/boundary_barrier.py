@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from nsm.surfaces.predicates import orientation
 from nsm.surfaces.topology import boundary_loops
 from nsm.tasks.curvature import Curvature
 
@@ -46,16 +47,14 @@ class BoundaryBarrier(nn.Module):
     Args:
         uv: (V, 2) vertices of the mesh in Ω.
         faces: (F, 3), counter-clockwise.
-        weight: of the term.
     """
 
     uv: Tensor
 
-    def __init__(self, uv: Tensor, faces: Tensor, weight: float = 1.0) -> None:
+    def __init__(self, uv: Tensor, faces: Tensor) -> None:
         super().__init__()
         loops = boundary_loops(faces.numpy())
         self.register_buffer("uv", uv[torch.from_numpy(np.concatenate(loops))], persistent=False)
-        self.weight = weight
         ends = np.cumsum([len(loop) for loop in loops])
         numbers = np.arange(ends[-1])
         self._head = numbers + 1  # of the side that begins at each vertex
@@ -69,7 +68,7 @@ class BoundaryBarrier(nn.Module):
         """The term under h in a step of the training: a scalar."""
         image = h(self.uv)
         pairs, crossings = self._found(image, step)
-        return self.weight * (_barrier(image, pairs)[0].sum() / len(image) + _CROSSED * crossings)
+        return _barrier(image, pairs)[0].sum() / len(image) + _CROSSED * crossings
 
     def curvature(self, h: Any, step: int) -> Curvature:
         """The second derivatives of the term by the distances, seen by each vertex apart."""
@@ -77,8 +76,7 @@ class BoundaryBarrier(nn.Module):
             image = h(self.uv).double()
             pairs, _ = self._found(image, step)
             _, second, normal, share = _barrier(image, pairs)
-            each = self.weight / len(image) * second[:, None, None] * normal[:, :, None]
-            each = each * normal[:, None, :]
+            each = second[:, None, None] / len(image) * normal[:, :, None] * normal[:, None, :]
             hessians = image.new_zeros(len(image), 2, 2)
             hessians.index_add_(0, pairs.vertex, each)
             hessians.index_add_(0, pairs.tail, (1 - share).square()[:, None, None] * each)
@@ -114,15 +112,10 @@ class BoundaryBarrier(nn.Module):
         i, j = pairs.T
         apart = (self._head[i] != j) & (self._head[j] != i)
         i, j = i[apart], j[apart]
-        across = _turn(tail[i], head[i], tail[j]) * _turn(tail[i], head[i], head[j]) <= 0
-        back = _turn(tail[j], head[j], tail[i]) * _turn(tail[j], head[j], head[i]) <= 0
+        a, b, c, d = tail[i], head[i], tail[j], head[j]
+        across = orientation(a, b, c) * orientation(a, b, d) <= 0
+        back = orientation(c, d, a) * orientation(c, d, b) <= 0
         return int((across & back).sum())
-
-
-def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The sign (M,) of the turn at b of the ways from points a over b to c, each (M, 2)."""
-    u, v = b - a, c - a
-    return np.sign(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
 
 
 def _barrier(image: Tensor, pairs: _Pairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:

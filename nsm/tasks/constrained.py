@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -77,7 +76,6 @@ class ConstrainedMap(AtTriangles):
         self.held_out = HeldOut()
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
-        self.quadrature, self.triangles_from = None, math.inf  # subclasses may measure at triangles
         # h maps Ω to itself by construction
         self.exact = not domain.has_boundary or self.constraints.boundary == "exact"
 

@@ -21,8 +21,6 @@ _HALVED = 3  # trials at most by half; then a triangle folds within a short way
 _FLAT = 1e-10  # pairs of less curvature say nothing
 # largest change of a coefficient in the first iteration of a step without known curvature
 _FIRST = 0.02
-
-
 # relative gain of a step on the last level, below which the next ones gain nothing
 _CONVERGED = 1e-4
 

@@ -103,7 +103,7 @@ def clasp():
 def test_what_is_pulled_across_the_boundary_stops_before_it(weight):
     vertices, faces, (first, last) = clasp()
     loop = boundary_loops(faces)[0]
-    barrier = BoundaryBarrier(torch.as_tensor(vertices), torch.as_tensor(faces), weight)
+    barrier = BoundaryBarrier(torch.as_tensor(vertices), torch.as_tensor(faces))
     assert np.array_equal(barrier.uv.numpy(), vertices[loop])
     h, start = Moved(vertices[loop]), torch.as_tensor(vertices[loop])
     ends = [int(np.flatnonzero(loop == k)[0]) for k in (first, last)]
@@ -116,7 +116,7 @@ def test_what_is_pulled_across_the_boundary_stops_before_it(weight):
             # the ends want to change places
             pulled = ((a - start[ends[1]]) ** 2 + (b - start[ends[0]]) ** 2).sum()
             bent = 0.1 * (h.image.diff(dim=0) - start.diff(dim=0)).square().sum()
-            loss = pulled + bent + barrier(h, step)
+            loss = pulled + bent + weight * barrier(h, step)
             loss.backward()
             return loss
 
