@@ -35,6 +35,29 @@ class _Pairs(NamedTuple):
     reach: Tensor
 
 
+class _Sides(NamedTuple):
+    """The sides of the boundary's image: both ends (P, 2), lengths (P,), and their middles."""
+
+    tail: np.ndarray
+    head: np.ndarray
+    length: np.ndarray
+    tree: cKDTree
+
+
+class _Begun(NamedTuple):
+    """Of the image with which a step of the training began.
+
+    Attributes:
+        step: its number.
+        reach: (2, P) a quarter of the shorter side of each vertex, and of each side.
+        crossings: pairs of sides that crossed.
+    """
+
+    step: int
+    reach: np.ndarray
+    crossings: int
+
+
 class BoundaryBarrier(nn.Module):
     """Σ max(0, ε/d − 1)² over vertices and sides of the boundary, by the number of vertices (Smith
     and Schaefer, 2015, "Bijective parameterization with free boundaries", Eq. 5).
@@ -59,22 +82,28 @@ class BoundaryBarrier(nn.Module):
         numbers = np.arange(ends[-1])
         self._head = numbers + 1  # of the side that begins at each vertex
         self._head[ends - 1] = ends - [len(loop) for loop in loops]
-        self._held: tuple[int, np.ndarray, int] | None = None  # step, reach, crossings
+        self._begun: _Begun | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_held": None}
+        return {**self.__dict__, "_begun": None}
 
     def forward(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
         """The term under h in a step of the training: a scalar."""
         image = h(self.uv)
-        pairs, crossings = self._found(image, step)
-        return _barrier(image, pairs)[0].sum() / len(image) + _CROSSED * crossings
+        if not image.isfinite().all():  # a step too far, which the loss then says
+            return image.sum() * torch.nan
+        sides = self._sides(image)
+        begun = self._at_start(sides, step)
+        new = max(0, self._crossings(sides) - begun.crossings)
+        near = self._near(sides, begun.reach, image)
+        return _barrier(image, near)[0].sum() / len(image) + _CROSSED * new
 
     def curvature(self, h: Any, step: int) -> Curvature:
         """The second derivatives of the term by the distances, seen by each vertex apart."""
         with torch.no_grad():
             image = h(self.uv).double()
-            pairs, _ = self._found(image, step)
+            sides = self._sides(image)
+            pairs = self._near(sides, self._at_start(sides, step).reach, image)
             _, second, normal, share = _barrier(image, pairs)
             each = second[:, None, None] / len(image) * normal[:, :, None] * normal[:, None, :]
             hessians = image.new_zeros(len(image), 2, 2)
@@ -83,36 +112,37 @@ class BoundaryBarrier(nn.Module):
             hessians.index_add_(0, pairs.head, share.square()[:, None, None] * each)
         return Curvature(h, self.uv, hessians)
 
-    def _found(self, image: Tensor, step: int) -> tuple[_Pairs, int]:
-        """The pairs on which the barrier may act, and how many crossings are new in this step."""
+    def _sides(self, image: Tensor) -> _Sides:
         tail = image.detach().double().cpu().numpy()
         head = tail[self._head]
-        length = np.linalg.norm(head - tail, axis=1)
-        tree = cKDTree(0.5 * (tail + head))
-        crossings = self._crossings(
-            tail, head, tree.query_pairs(length.max(), output_type="ndarray")
-        )
-        if self._held is None or self._held[0] != step:
-            own = np.minimum(length, length[np.argsort(self._head)])  # both sides of a vertex
-            self._held = step, _NEAR * np.stack([own, length]), crossings
-        reach = self._held[1]
-        around = 0.5 * length.max() + reach.max()
-        near = tree.sparse_distance_matrix(cKDTree(tail), around, output_type="ndarray")
+        return _Sides(tail, head, np.linalg.norm(head - tail, axis=1), cKDTree(0.5 * (tail + head)))
+
+    def _at_start(self, sides: _Sides, step: int) -> _Begun:
+        """What is kept of the image with which a step began."""
+        if self._begun is None or self._begun.step != step:
+            own = np.minimum(sides.length, sides.length[np.argsort(self._head)])
+            reach = _NEAR * np.stack([own, sides.length])
+            self._begun = _Begun(step, reach, self._crossings(sides))
+        return self._begun
+
+    def _near(self, sides: _Sides, reach: np.ndarray, like: Tensor) -> _Pairs:
+        """The pairs on which the barrier may act."""
+        around = 0.5 * sides.length.max() + reach.max()
+        near = sides.tree.sparse_distance_matrix(cKDTree(sides.tail), around, output_type="ndarray")
         side, vertex = near["i"], near["j"]
         apart = (side != vertex) & (self._head[side] != vertex)
         side, vertex = side[apart], vertex[apart]
         both = np.minimum(reach[0, vertex], reach[1, side])
         found = (vertex, side, self._head[side])
-        a, b, c = (torch.from_numpy(each).to(image.device) for each in found)
-        pairs = _Pairs(a, b, c, torch.from_numpy(both).to(image))
-        return pairs, max(0, crossings - self._held[2])
+        a, b, c = (torch.from_numpy(each).to(like.device) for each in found)
+        return _Pairs(a, b, c, torch.from_numpy(both).to(like))
 
-    def _crossings(self, tail: np.ndarray, head: np.ndarray, pairs: np.ndarray) -> int:
-        """How many of the pairs (M, 2) of sides cross."""
-        i, j = pairs.T
+    def _crossings(self, sides: _Sides) -> int:
+        """How many pairs of sides cross."""
+        i, j = sides.tree.query_pairs(sides.length.max(), output_type="ndarray").T
         apart = (self._head[i] != j) & (self._head[j] != i)
         i, j = i[apart], j[apart]
-        a, b, c, d = tail[i], head[i], tail[j], head[j]
+        a, b, c, d = sides.tail[i], sides.head[i], sides.tail[j], sides.head[j]
         across = orientation(a, b, c) * orientation(a, b, d) <= 0
         back = orientation(c, d, a) * orientation(c, d, b) <= 0
         return int((across & back).sum())

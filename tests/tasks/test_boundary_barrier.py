@@ -123,3 +123,8 @@ def test_what_is_pulled_across_the_boundary_stops_before_it(weight):
         optimizer.step(closure)
     crossings = boundary_self_intersections(h.image.detach().numpy(), np.arange(len(loop)))
     assert (crossings > 0) == (weight == 0)
+
+
+def test_an_image_that_is_not_finite_has_no_finite_loss():
+    barrier = barrier_of(dented(0.05))[0]
+    assert barrier(Moved(SQUARE * np.nan), 1).isnan()
