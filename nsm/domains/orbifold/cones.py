@@ -19,7 +19,7 @@ from nsm.surfaces.geometry import edge_graph
 
 _FACES = 3000  # of the mesh on which extremities are found, and the last candidates compared
 LARGE = 40_000
-_FEW = 400  # of the mesh on which all candidates are compared
+_FEW = 200  # of the mesh on which all candidates are compared
 _EXTREMITIES = 6
 _CLOSE = 0.12  # of the largest distance: two extremities nearer than this are one
 _SOURCES = 96
