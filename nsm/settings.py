@@ -238,7 +238,7 @@ class PhiSettings:
 
     path: str | None = None
     overrides: list[str] = field(default_factory=list)
-    steps: Whole | None = None
+    steps: Whole | None = 0
     processes: Count | None = None
 
 

@@ -195,7 +195,7 @@ def test_groups_can_be_changed_separately():
 def test_only_a_grid_and_a_surface_can_be_fitted(overrides, linear_skip, steps):
     config = compose_config(overrides)
     assert (config.map.linear_skip, config.trainer.max_steps) == (linear_skip, steps)
-    assert config.scheduler.get("peak", 1.0) == (0.0005 if linear_skip == "fitted" else 1.0)
+    assert config.scheduler.get("peak", 1.0) == (0.0001 if linear_skip == "fitted" else 1.0)
 
 
 def test_the_surface_group_is_the_catalogue():

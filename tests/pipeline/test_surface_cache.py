@@ -90,19 +90,20 @@ def steps_of(*words, overrides=()):
     return overfit.trainer.max_steps, surface_cache._folder_of(dome(0.4, 4), plain(overfit)).name
 
 
-def test_maps_may_take_the_fit_alone():
-    alone, few, whole = (steps_of(*words) for words in (["phi.steps=0"], ["phi.steps=100"], []))
+def test_maps_take_the_fit_alone():
+    choices = ([], ["phi.steps=100"], ["phi.steps=null"])
+    alone, few, whole = (steps_of(*words) for words in choices)
     assert alone[0] == 0 and few[0] == 100
     assert whole[0] == compose_config(["task=overfit"]).trainer.max_steps > 100
     assert len({alone[1], few[1], whole[1]}) == 3  # apart in the cache
-    assert steps_of("phi.steps=0", overrides=["trainer.max_steps=70"])[0] == 70
+    assert steps_of(overrides=["trainer.max_steps=70"])[0] == 70
 
 
 @pytest.mark.parametrize("choice", ["initialization=random", "encoding=fourier", "map=residual"])
 def test_without_a_fit_there_is_a_whole_training(choice):
     whole = compose_config(["task=overfit", choice])
     fitted = whole.map.get("linear_skip") == "fitted"
-    steps = steps_of("phi.steps=0", overrides=[choice])[0]
+    steps = steps_of(overrides=[choice])[0]
     assert steps == (0 if fitted else whole.trainer.max_steps)
 
 
