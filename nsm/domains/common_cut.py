@@ -9,13 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nsm.domains.base import BoundedDomain, Keys
+from nsm.domains.common_handles import open_handles
 from nsm.domains.common_seams import (
     SEAMS,
     aligned_keys,
-    boundary_keys,
-    corresponding_paths,
+    branch_keys,
+    lead_tree,
     mutually_far,
     seam_costs,
+    tracers_of,
 )
 from nsm.domains.disc import Disc
 from nsm.errors import NsmError
@@ -50,7 +52,7 @@ def best_common_cut(
     seam_landmarks: int | None,
     others: Sequence[np.ndarray],
 ) -> CommonCut:
-    """Closed genus-0 meshes cut along corresponding seams.
+    """Closed meshes of one genus cut along corresponding seams.
 
     Args:
         names: of the meshes, in messages.
@@ -109,16 +111,14 @@ def _common_cut(
     chosen = mutually_far(pairs, landmarks, count)
     on_seam = [ids[chosen] for ids in landmarks]
     avoid = [np.concatenate([ids, more]) for ids, more in zip(landmarks, others, strict=True)]
-    paths = corresponding_paths(pairs, on_seam, costs, avoid=avoid)
-    if paths is None:
+    tracers = tracers_of(pairs, on_seam, costs, avoid)
+    if not (lead_tree(tracers) and open_handles(tracers)):
         return None
     cuts = [
-        cut_along_paths(c.vertices, c.faces, p, name=name)
-        for c, p, name in zip(cleaned, paths, names, strict=True)
+        cut_along_paths(c.vertices, c.faces, t.laid, name=name)
+        for c, t, name in zip(cleaned, tracers, names, strict=True)
     ]
-    keys = aligned_keys(
-        [boundary_keys(cut.origin, cut.loop, ids) for cut, ids in zip(cuts, on_seam, strict=True)]
-    )
+    keys = aligned_keys([branch_keys(c, t.laid) for c, t in zip(cuts, tracers, strict=True)])
     assert keys is not None, "branches in the same cyclic order make equal walks"
     return CommonCut(seam, len(chosen), cuts, [k[:, 1] for k in keys])
 

@@ -12,6 +12,7 @@ import heapq
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -19,6 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.cutting import Cut
 from nsm.surfaces.geometry import ambient_occlusion
 
 # A sector at a landmark is named by the branch before it, counter-clockwise; -1 without branches.
@@ -26,28 +28,35 @@ _WHOLE = -1
 
 
 @dataclass
-class _Tracer:
+class Tracer:
     """Paths on one closed mesh (V, 3), (F, 3) between landmarks (L,), disjoint except for ends."""
 
     vertices: np.ndarray
     faces: np.ndarray
     landmarks: np.ndarray
     cost: np.ndarray  # (E,) of each edge
-    # per landmark: the branch number of each first vertex on the way out
+    # per landmark: the number of a branch's end, 2b or 2b + 1, by the first vertex on the way out
     spokes: list[dict[int, int]] = field(init=False)
+    laid: list[list[int]] = field(init=False)  # the branches
 
     def __post_init__(self) -> None:
+        self.laid = []
         self.edges = topology.edges_of(self.faces).pairs
         self.taken = np.zeros(len(self.vertices), dtype=bool)
         self.taken[self.landmarks] = True
         self.spokes = [{} for _ in self.landmarks]
         self.rings = [_ring(self.faces, int(v)) for v in self.landmarks]
 
-    def distances(self) -> np.ndarray:
-        """(L, L) costs of the cheapest paths between landmarks, ignoring branches."""
+    @cached_property
+    def away(self) -> np.ndarray:
+        """(L, V) costs of the cheapest paths from landmarks, ignoring branches."""
         n = len(self.vertices)
         graph = csr_matrix((self.cost, tuple(self.edges.T)), shape=(n, n))
-        return dijkstra(graph, directed=False, indices=self.landmarks)[:, self.landmarks]
+        return np.asarray(dijkstra(graph, directed=False, indices=self.landmarks))
+
+    def distances(self) -> np.ndarray:
+        """(L, L) of these, between landmarks."""
+        return self.away[:, self.landmarks]
 
     def sectors(self, landmark: int) -> dict[int, list[int]]:
         """Neighbours of a landmark by sector, along which a further branch may leave."""
@@ -92,11 +101,13 @@ class _Tracer:
             path.append(int(before[path[-1]]))
         return float(distance[b]), path[::-1]
 
-    def add(self, branch: int, i: int, j: int, path: list[int]) -> None:
-        """Add a path to the seam as a branch."""
+    def add(self, i: int, j: int, path: list[int]) -> None:
+        """Add a path between landmarks i and j to the seam as its next branch."""
+        branch = len(self.laid)
+        self.laid.append(path)
         self.taken[path] = True
-        self.spokes[i][path[1]] = branch
-        self.spokes[j][path[-2]] = branch
+        self.spokes[i][path[1]] = 2 * branch
+        self.spokes[j][path[-2]] = 2 * branch + 1
 
 
 def _ring(faces: np.ndarray, vertex: int) -> list[int]:
@@ -133,28 +144,46 @@ def corresponding_paths(
         Per mesh, the branches as lists of vertices; branch b joins the same landmarks everywhere.
         None if no tree was found (landmarks too close together for the mesh's edges).
     """
+    tracers = tracers_of(meshes, landmarks, costs, avoid)
+    return [t.laid for t in tracers] if lead_tree(tracers, begun) else None
+
+
+def tracers_of(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]],
+    landmarks: Sequence[np.ndarray],
+    costs: Sequence[np.ndarray] | None = None,
+    avoid: Sequence[np.ndarray] | None = None,
+) -> list[Tracer]:
+    """What leads branches on each mesh; arguments as of :func:`corresponding_paths`, any genus."""
     tracers = []
     for m, (vertices, faces) in enumerate(meshes):
         unit = np.sqrt(topology.face_areas(vertices, faces).sum())
         cost = edge_lengths(vertices, faces) if costs is None else costs[m]
-        tracers.append(_Tracer(vertices, faces, np.asarray(landmarks[m]), cost / unit))
+        tracers.append(Tracer(vertices, faces, np.asarray(landmarks[m]), cost / unit))
         if avoid is not None:
             tracers[-1].taken[avoid[m]] = True
+    return tracers
+
+
+def lead_tree(tracers: Sequence[Tracer], begun: Sequence[tuple[int, int]] = ()) -> bool:
+    """Lay the branches of a tree through all landmarks; whether there is one.
+
+    Args:
+        tracers: of each mesh, without branches.
+        begun: as for :func:`corresponding_paths`.
+    """
     mean = np.sum([t.distances() for t in tracers], axis=0)
-    count = len(landmarks[0])
+    count = len(tracers[0].landmarks)
     queue = [(float(mean[i, j]), i, j) for i, j in itertools.combinations(range(count), 2)]
     heapq.heapify(queue)
     component = list(range(count))
-    branches: list[list[list[int]]] = [[] for _ in meshes]
     for i, j in begun:
-        for tracer, laid in zip(tracers, branches, strict=True):
-            path = [int(tracer.landmarks[i]), int(tracer.landmarks[j])]
-            tracer.add(len(laid), i, j, path)
-            laid.append(path)
+        for tracer in tracers:
+            tracer.add(i, j, [int(tracer.landmarks[i]), int(tracer.landmarks[j])])
         component = [component[i] if c == component[j] else c for c in component]
-    while len(branches[0]) < count - 1:
+    while len(tracers[0].laid) < count - 1:
         if not queue:
-            return None
+            return False
         _, i, j = heapq.heappop(queue)
         if component[i] == component[j]:
             continue
@@ -164,15 +193,14 @@ def corresponding_paths(
         if queue and total > queue[0][0] + 1e-12:
             heapq.heappush(queue, (total, i, j))  # others may be shorter now
             continue
-        for tracer, laid, path in zip(tracers, branches, paths, strict=True):
-            tracer.add(len(laid), i, j, path)
-            laid.append(path)
+        for tracer, path in zip(tracers, paths, strict=True):
+            tracer.add(i, j, path)
         old, new = component[j], component[i]
         component = [new if c == old else c for c in component]
-    return branches
+    return True
 
 
-def _cheapest(tracers: Sequence[_Tracer], i: int, j: int) -> tuple[float, list[list[int]]]:
+def _cheapest(tracers: Sequence[Tracer], i: int, j: int) -> tuple[float, list[list[int]]]:
     """The paths from i to j, one per mesh, in the same sectors, that are cheapest in sum."""
     best: tuple[float, list[list[int]]] = (float("inf"), [])
     for s, t in itertools.product(tracers[0].sectors(i), tracers[0].sectors(j)):
@@ -229,7 +257,7 @@ def mutually_far(
     for (vertices, faces), ids in zip(meshes, landmarks, strict=True):
         unit = np.sqrt(topology.face_areas(vertices, faces).sum())
         cost = edge_lengths(vertices, faces) / unit
-        distance += _Tracer(vertices, faces, np.asarray(ids), cost).distances()
+        distance += Tracer(vertices, faces, np.asarray(ids), cost).distances()
     chosen = [int(k) for k in np.unravel_index(distance.argmax(), distance.shape)]
     while len(chosen) < count:
         chosen.append(int(distance[chosen].min(axis=0).argmax()))
@@ -250,15 +278,43 @@ def boundary_keys(origin: np.ndarray, loop: np.ndarray, landmarks: np.ndarray) -
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-def aligned_keys(keys: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+def branch_keys(cut: Cut, paths: Sequence[list[int]]) -> np.ndarray:
+    """(K, 2) int64: as :func:`boundary_keys`, of the ends of a seam's branches, with the number of
+    the end, 2b or 2b + 1, in place of the landmark's: the one along which the walk goes on."""
+    number = {}
+    for b, path in enumerate(paths):
+        number[path[0], path[1]] = 2 * b
+        number[path[-1], path[-2]] = 2 * b + 1
+    own = cut.origin[cut.loop]
+    steps = zip(own.tolist(), np.roll(own, -1).tolist(), strict=True)
+    rows = [(number[s], int(v)) for s, v in zip(steps, cut.loop, strict=True) if s in number]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def aligned_keys(
+    keys: Sequence[np.ndarray], places: Sequence[np.ndarray] | None = None
+) -> list[np.ndarray] | None:
     """The keys (K, 2) of several loops, rotated so that their landmarks come in the same order;
-    None if no rotation does that."""
+    None if no rotation does that.
+
+    Args:
+        keys: of each loop.
+        places: points (K, 2) of each loop's keys. Where several rotations serve, as of a seam with
+            several branches between two landmarks, these are nearest by the one that is taken.
+    """
     first = keys[0][:, 0].tolist()
     result = [keys[0]]
-    for other in keys[1:]:
+    for m, other in enumerate(keys[1:], 1):
         order = other[:, 0].tolist()
-        turn = next((k for k in range(len(order)) if order[k:] + order[:k] == first), None)
-        if len(order) != len(first) or (turn is None and first):
+        turns = [k for k in range(len(order)) if order[k:] + order[:k] == first]
+        if len(order) != len(first) or (not turns and first):
             return None
-        result.append(np.roll(other, -(turn or 0), axis=0))
+        if places is not None and len(turns) > 1:
+            turns.sort(key=partial(_turned_apart, places[0], places[m]))
+        result.append(np.roll(other, -turns[0] if turns else 0, axis=0))
     return result
+
+
+def _turned_apart(here: np.ndarray, there: np.ndarray, turn: int) -> float:
+    """How far points (K, 2) are from others, rotated in their order."""
+    return float(np.abs(np.roll(there, -turn, axis=0) - here).sum())

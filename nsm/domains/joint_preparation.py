@@ -67,8 +67,8 @@ def prepare_jointly(
 ) -> list[Surface]:
     """Prepare meshes so that corresponding landmarks have corresponding places in Ω.
 
-    For a domain with boundary, closed genus-0 meshes with two landmarks or more are cut along
-    corresponding seams, and the landmarks on the seam get the same places on ∂Ω in all of them. So
+    For a domain with boundary, closed meshes with two landmarks or more are cut along corresponding
+    seams, and the landmarks on the seam get the same places on ∂Ω in all of them. So
     are open ones with several boundaries; boundaries that correspond have the same places then. On
     the orbifold, meshes with four landmarks or more get the same four as their cones, those whose
     domains are least distorted in the mean. Other meshes are prepared one by one.
@@ -111,7 +111,8 @@ def prepare_jointly(
         and genus == 0
         and needs_common_boundaries(cleaned, common_ids[0])
     )
-    if apart or not several and (common != (0, 0) or not enough):
+    alike = enough and loops == 0 and (genus == 0 or domain.has_boundary)
+    if apart or not (several or alike):
         # apart, seams cannot pass one landmark in corresponding places
         inside = landmarks if apart else [np.zeros(0, np.int64)] * len(meshes)
 
@@ -339,7 +340,7 @@ class Matched:
 
         The walk around ∂Ω passes each branch of the seam twice, out and back. ``count`` points on
         the way out are paired with those on the way back at the same shares of the length. Nothing
-        is paired where the walk is not around a tree.
+        is paired where the walk is not around a tree, or several branches join two landmarks.
         """
         numbers = self.numbers[: self.on_boundary].tolist()
         t = domain.boundary_fractions(self.points[0][: self.on_boundary])
@@ -350,6 +351,8 @@ class Matched:
             )
             for k in range(len(numbers))
         }
+        if len(ways) < len(numbers):
+            return np.zeros((0, 2, 2))
         share = (np.arange(count) + 0.5) / count
         pairs = []
         for (a, b), (begin, span) in ways.items():
@@ -390,7 +393,7 @@ def matched_landmarks(surfaces: Sequence[Surface], landmarks: Sequence[np.ndarra
                 key="landmarks",
             )
         keys.append(key)
-    aligned = aligned_keys(keys)
+    aligned = aligned_keys(keys, [s.uv[key[:, 1]] for s, key in zip(surfaces, keys, strict=True)])
     if aligned is None:
         names = " and ".join(s.name for s in surfaces)
         raise NsmError(

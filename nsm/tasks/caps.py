@@ -48,7 +48,7 @@ class Caps(nn.Module):
         some = self.quadrature.take()
         image = h(some.uv)
         B = first_fundamental_form(some.sides(psi(image)))
-        determinant = some.sides(image).det() / some.determinant
+        determinant = some.relative(some.sides(image))
         values = energy.total(energy.parts(some.metric, B, some.at))
         folds = self.folds(determinant, step)
         share = some.share

@@ -41,6 +41,13 @@ class Triangles(NamedTuple):
         a, b, c = image[self.faces].unbind(dim=1)
         return torch.stack([b - a, c - a], dim=-1)
 
+    def relative(self, sides: Tensor) -> Tensor:
+        """Determinants (F,) of sides (F, 2, 2) that a planar map makes of the triangles' own, in
+        units of these; 1 where single precision does not tell."""
+        told = self.oriented > 0
+        own = torch.where(told, self.determinant, 1.0)
+        return torch.where(told, sides.det() / own, 1.0)
+
     def centres_on(self, image: Tensor) -> Tensor:
         """The centres (F, n) of the triangles with images (V, n) of the corners."""
         return image[self.faces].mean(dim=1)

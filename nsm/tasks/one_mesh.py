@@ -55,7 +55,7 @@ class OneMeshMap(AtTriangles):
             one = batch.uv.new_ones(len(batch.uv))
             return Places(batch.uv, At(batch.uv, batch.points), one / len(one), one, None)
         with torch.no_grad():
-            determinant = some.sides(self.map(some.uv)).det() / some.determinant
+            determinant = some.relative(some.sides(self.map(some.uv)))
         told = some.oriented / some.share.clamp(min=1e-30)
         return Places(some.centres, some.at, some.share, told, determinant)
 
@@ -100,7 +100,7 @@ class OneMeshMap(AtTriangles):
         """
         centre = some.centres_on(some.points)
         parts = self.energy.parts(some.metric, image_metric, some.at)
-        det = sides.det() / some.determinant
+        det = some.relative(sides)
         evaluation = Evaluation(
             some.centres, centre, some.centres_on(h), some.metric, image_metric, det, some.oriented
         )

@@ -72,7 +72,7 @@ def start(rotation):
     return Rotated(torch.nn.Identity(), rotation)
 
 
-def pair(phi, psi, points=NONE, targets=NONE, rotation=None, **changes):
+def pair(phi, psi, points=NONE, targets=NONE, rotation=None, mesh=MESH, **changes):
     torch.manual_seed(0)
     return quiet(PairMap)(
         **settings(changes),
@@ -80,7 +80,7 @@ def pair(phi, psi, points=NONE, targets=NONE, rotation=None, **changes):
         targets=targets,
         seam=torch.zeros(0, 2, 2),
         start=start(torch.eye(2) if rotation is None else rotation),
-        mesh=MESH,
+        mesh=mesh,
         diagonal=1.0,
         phi=phi,
         psi=psi,
@@ -135,6 +135,19 @@ def test_the_distortion_of_caps_hardly_counts_but_they_must_not_fold():
     loss = module.training_step(Batch(samples()), 0)
     least = 2 + 2 / 1.01
     assert loss.item() == pytest.approx(least + 0.01 * math.log1p(least), rel=1e-4)
+
+
+def test_a_triangle_without_area_in_the_domain_leaves_loss_and_gradient_finite():
+    points, faces = MESH
+    flat = torch.tensor([[0.0, 0.0], [0.25, 0.0], [0.5, 0.0]])
+    mesh = (torch.cat([points, flat]), torch.cat([faces, len(points) + torch.arange(3)[None]]))
+    changes = {"mesh": mesh, "constraints": {**CONSTRAINTS, "triangles_from": 0.0}}
+    module = pair(surface("saddle"), surface("saddle"), **changes)
+    loss = module.training_step(Batch(samples()), 0)
+    loss.backward()
+    assert loss.item() == pytest.approx(2 + 2 / 1.01, rel=1e-4)
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    assert gradients and all(torch.isfinite(g).all() for g in gradients)
 
 
 def test_an_isometry_between_different_surfaces_is_the_minimum():
