@@ -124,9 +124,7 @@ def landmark_lists(
     return [own[kept] if isinstance(own, np.ndarray) else [own[k] for k in kept] for own in lists]
 
 
-def all_landmarks(
-    given: Any, surfaces: Sequence[str]
-) -> tuple[list[Landmarks], list[str] | None]:
+def all_landmarks(given: Any, surfaces: Sequence[str]) -> tuple[list[Landmarks], list[str] | None]:
     """Landmarks as :func:`landmark_vertices` takes them, also those that one surface alone has, for
     each of the surfaces with these names; and the landmarks' names, if they have some.
 
