@@ -26,7 +26,7 @@ QUICK = [
 
 
 def command(*words: str) -> list[str]:
-    return [sys.executable, "-m", "nsm.cli", *words]
+    return [sys.executable, "-m", "nsm", *words]
 
 
 def run(folder: Path, *words: str, **extra) -> subprocess.CompletedProcess:

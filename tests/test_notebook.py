@@ -18,6 +18,7 @@ def test_the_notebook_runs_and_is_stored_without_output(tmp_path, monkeypatch):
     resources = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=300, resources=resources).execute()
     outputs = [cell.outputs for cell in notebook.cells if cell.cell_type == "code"]
+    assert not [o.text for of_one in outputs for o in of_one if o.get("name") == "stderr"]
     certificate = next(
         o.data["text/plain"] for o in outputs[3] if o.output_type == "execute_result"
     )

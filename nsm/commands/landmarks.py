@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from rich.console import Console
 
 from nsm.arguments import Arguments
@@ -18,8 +19,9 @@ from nsm.stages import stage
 
 if TYPE_CHECKING:
     from nsm.correspondence.landmark_list import LandmarkList
+    from nsm.domains.joint_preparation import Mesh
     from nsm.results.view import EditedShape
-    from nsm.surfaces.validation import Repairs
+    from nsm.surfaces.validation import CleanMesh
 
 
 def main(arguments: list[str]) -> None:
@@ -40,7 +42,11 @@ def main(arguments: list[str]) -> None:
     )
     parser.add_argument("mesh", nargs="+", metavar="MESH", help="a mesh file or a catalogue name")
     parser.add_argument(
-        "--landmarks", type=Path, metavar="FILE", help="begin with the landmarks of a JSON file"
+        "--landmarks",
+        nargs="+",
+        metavar="FILE",
+        help="begin with these: a file of all meshes, a file for each, or a folder, in any format "
+        "that landmarks=... takes",
     )
     parser.add_argument(
         "--out",
@@ -66,7 +72,7 @@ def main(arguments: list[str]) -> None:
     given = parser.parse_args(arguments)
     if len(given.mesh) < 2:
         raise NsmError("nsm landmarks: give two meshes or more", kind="bad_argument")
-    if given.out.exists() and given.out != given.landmarks:
+    if given.out.exists() and (given.landmarks or []) != [str(given.out)]:
         raise NsmError(
             f"{given.out}: exists; begin with it by --landmarks {given.out}, or give another --out",
             kind="file_exists",
@@ -76,11 +82,20 @@ def main(arguments: list[str]) -> None:
     needed("viser", "nsm landmarks", "view")
     # torch takes seconds to import, which --help and wrong options do not need
     with loading_libraries(frozen=True):
-        from nsm.results.view import LandmarkEditor, running
+        from nsm.correspondence.landmark_list import LandmarkList
+        from nsm.results.view import EditedShape, LandmarkEditor, running
         from nsm.surfaces.validation import Repairs
 
-    shapes = [_shape(name, Repairs(part, given.repair)) for name in given.mesh]
-    landmarks = _start(shapes, given.landmarks, given.empty)
+    meshes = [_mesh(name) for name in given.mesh]
+    cleaned = [mesh.cleaned(Repairs(part, given.repair)) for mesh in meshes]
+    shapes = [
+        EditedShape(mesh.name, clean.vertices, clean.faces, clean.source_vertex)
+        for mesh, clean in zip(meshes, cleaned, strict=True)
+    ]
+    if given.landmarks:
+        landmarks = _given(given.landmarks, meshes, cleaned)
+    else:
+        landmarks = LandmarkList(len(shapes)) if given.empty else _proposed(shapes)
     with running("nsm landmarks", given.host, given.port) as (server, address):
         editor = LandmarkEditor(shapes, landmarks, given.out, server)
         if given.check:
@@ -105,51 +120,43 @@ def _part(given: str | None) -> Literal["largest"] | int | None:
     return int(given)
 
 
-def _shape(name: str, repairs: Repairs) -> EditedShape:
+def _mesh(name: str) -> Mesh:
     from nsm.domains import domain
     from nsm.domains.joint_preparation import Mesh
     from nsm.pipeline.resolve_inputs import read_shape
-    from nsm.results.view import EditedShape
-    from nsm.surfaces.validation import clean
 
     mesh = read_shape(name, domain("disc"), "mesh")
     if not isinstance(mesh, Mesh):
         raise NsmError(f"{name}: no mesh; give a mesh file", kind="wrong_type", key=name)
-    cleaned = clean(mesh.vertices, mesh.faces, mesh.name, repairs)
-    return EditedShape(mesh.name, cleaned.vertices, cleaned.faces, cleaned.source_vertex)
+    return mesh
 
 
-def _start(shapes: Sequence[EditedShape], file: Path | None, empty: bool) -> LandmarkList:
-    """The landmarks of a file, or those proposed; none where nothing can be proposed."""
+def _given(files: list[str], meshes: list[Mesh], cleaned: list[CleanMesh]) -> LandmarkList:
+    """The landmarks of files, in all formats of tasks, also those that one mesh alone has."""
     from nsm.correspondence.landmark_list import LandmarkList
-    from nsm.surfaces.landmark_files import read_collection, read_names, read_pairs
-    from nsm.surfaces.landmarks import as_vertices, check_equal_lengths, numbered
+    from nsm.pipeline.landmark_inputs import all_landmarks
+    from nsm.surfaces.landmarks import MISSING, as_vertices
 
-    count = len(shapes)
-    if file is not None:
-        lists = list(read_pairs(file)) if count == 2 else read_collection(file)
-        if len(lists) != count:
+    given = files if len(files) > 1 else files[0]
+    lists, names = all_landmarks(given, [mesh.name for mesh in meshes])
+    ids = []
+    for mesh, clean, of_one in zip(meshes, cleaned, lists, strict=True):
+        vertex = as_vertices(of_one, mesh.vertices, mesh.faces, mesh.name).vertex
+        local = np.where(vertex == MISSING, MISSING, clean.merged[vertex])
+        for k in np.flatnonzero((local < 0) & (vertex != MISSING)).tolist():
             raise NsmError(
-                f"{file}: landmarks of {len(lists)} surfaces; {count} are edited",
-                kind="out_of_range",
-                key=str(file),
+                f"{mesh.name}: landmark {k}, vertex {vertex[k]}, is not on the part that is kept",
+                kind="not_on_surface",
+                key=mesh.name,
             )
-        check_equal_lengths([shape.name for shape in shapes], lists)
-        ids = [
-            as_vertices(numbered(of_one, s.numbers, s.name), s.vertices, s.faces, s.name).vertex
-            for s, of_one in zip(shapes, lists, strict=True)
-        ]
-        names = read_names(file)
-        if names is not None and len(names) != len(ids[0]):
-            raise NsmError(
-                f"{file}: {len(names)} names for {len(ids[0])} landmarks",
-                kind="different_lengths",
-                key=str(file),
-            )
-        return LandmarkList(count, ids, names)
-    if empty:
-        return LandmarkList(count)
+        ids.append(local)
+    return LandmarkList(len(meshes), ids, names)
+
+
+def _proposed(shapes: Sequence[EditedShape]) -> LandmarkList:
+    """The landmarks that are proposed; none where nothing can be."""
     from nsm.correspondence import proposed_for_all
+    from nsm.correspondence.landmark_list import LandmarkList
 
     console = Console(highlight=False)
     try:
@@ -157,7 +164,7 @@ def _start(shapes: Sequence[EditedShape], file: Path | None, empty: bool) -> Lan
             found = proposed_for_all([(s.vertices, s.faces) for s in shapes])
     except NsmError as error:
         console.print(f"begins without landmarks: {error}", soft_wrap=True, markup=False)
-        return LandmarkList(count)
+        return LandmarkList(len(shapes))
     sure = "sure" if found.sure else "NOT SURE, check each"
     console.print(f"{len(found.vertices[0])} landmarks proposed, {sure}")
-    return LandmarkList(count, list(found.vertices[0].T))
+    return LandmarkList(len(shapes), list(found.vertices[0].T))

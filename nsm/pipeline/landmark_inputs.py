@@ -13,7 +13,13 @@ from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.catalogue import catalogue_landmarks, has_landmarks
-from nsm.surfaces.landmark_files import Marks, read_collection, read_marks, read_pairs
+from nsm.surfaces.landmark_files import (
+    Marks,
+    read_collection,
+    read_marks,
+    read_names,
+    read_pairs,
+)
 from nsm.surfaces.landmark_lookup import files_in, read_table
 from nsm.surfaces.landmarks import (
     MISSING,
@@ -87,9 +93,7 @@ def landmark_lists(
     Raises:
         NsmError: as :func:`landmark_vertices`.
     """
-    found, labels = _lists(given, names)
-    lists = [listed(item, f"landmarks of {name}") for item, name in zip(found, names, strict=True)]
-    check_equal_lengths(names, lists)
+    lists, labels = all_landmarks(given, names)
     there = np.stack([present(own) for own in lists])
     shared = there.sum(axis=0) > 1
     if template:
@@ -120,6 +124,25 @@ def landmark_lists(
     return [own[kept] if isinstance(own, np.ndarray) else [own[k] for k in kept] for own in lists]
 
 
+def all_landmarks(given: Any, surfaces: Sequence[str]) -> tuple[list[Landmarks], list[str] | None]:
+    """Landmarks as :func:`landmark_vertices` takes them, also those that one surface alone has, for
+    each of the surfaces with these names; and the landmarks' names, if they have some.
+
+    Raises:
+        NsmError: a file that cannot be read, or lists of different lengths.
+    """
+    found, labels = _lists(given, surfaces)
+    lists = [listed(x, f"landmarks of {name}") for x, name in zip(found, surfaces, strict=True)]
+    check_equal_lengths(surfaces, lists)
+    if labels is not None and len(labels) != len(lists[0]):
+        raise NsmError(
+            f"{given}: {len(labels)} names for {len(lists[0])} landmarks; give one for each",
+            kind="different_lengths",
+            key="landmarks",
+        )
+    return lists, labels
+
+
 def _lists(given: Any, surfaces: Sequence[str]) -> tuple[list[Any], list[str] | None]:
     """A list of landmarks for each surface, and the landmarks' names, if they have some."""
     count, labels = len(surfaces), None
@@ -140,6 +163,7 @@ def _lists(given: Any, surfaces: Sequence[str]) -> tuple[list[Any], list[str] | 
         lists, labels = [table.columns[name] for name in surfaces], table.names
     elif isinstance(given, (str, Path)):
         lists = list(read_pairs(given)) if count == 2 else read_collection(given)
+        labels = read_names(given)
     elif isinstance(given, dict):
         try:
             lists = [given["source"], given["target"]]

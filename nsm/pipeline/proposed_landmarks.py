@@ -181,7 +181,8 @@ def given_or_proposed(
     if not (asked or (possible and (none or few))):
         return list(shapes), ids, None
     repairs = configured_repairs(config)
-    with stage(console, f"proposing landmarks of {', '.join(mesh.name for mesh in meshes)}"):
+    what = "landmarks" if none else "further landmarks"
+    with stage(console, f"proposing {what} of {', '.join(mesh.name for mesh in meshes)}"):
         cleaned = [mesh.cleaned(repairs) for mesh in meshes]
         if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
             return list(shapes), ids, None

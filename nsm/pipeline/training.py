@@ -277,7 +277,7 @@ def check_device(config: DictConfig) -> None:
         else:
             reason = "torch finds no GPU; give device=cpu, or install a driver and torch for it"
         raise NsmError(
-            f"setting trainer.accelerator=gpu: {reason}",
+            f"device=cuda (trainer.accelerator=gpu): {reason}",
             kind="no_such_device",
             key="trainer.accelerator",
         )

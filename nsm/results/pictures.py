@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 PANEL = 640
 # at least as many triangles show the shape of φ rather than that of the mesh
 _FINE_FACES = 30_000
+_VANISHING = 1e-3  # of the mean area element around a vertex: less has no direction
 
 
 def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> None:
@@ -51,7 +52,7 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     off = neural.metrics.get("normal_error_mean_degrees")
     normals = [
         vertex_normals(surface.vertices, surface.faces, surface.seam_pairs),
-        neural_normals(neural.map, surface.uv),
+        normals_at_vertices(neural.map, surface),
     ]
     below = [
         (
@@ -77,6 +78,18 @@ def neural_normals(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
     jacobian = evaluate_jacobian(phi, uv)[1]
     cross = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
     return cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-30)[:, None]
+
+
+def normals_at_vertices(phi: nn.Module, surface: Surface) -> np.ndarray:
+    """Unit normals (V, 3) of φ; those of its image's triangles where its Jacobian vanishes, as at
+    the cones of a closed domain."""
+    points, jacobian = evaluate_jacobian(phi, surface.uv)
+    area = np.linalg.norm(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]), axis=1)
+    middle = evaluate_jacobian(phi, surface.uv[surface.faces].mean(axis=1))[1]
+    around = np.linalg.norm(np.cross(middle[:, :, 0], middle[:, :, 1]), axis=1)
+    vanishing = area < _VANISHING * vertex_means(around, surface.faces, len(area))
+    of_triangles = vertex_normals(points, surface.faces, surface.seam_pairs)
+    return np.where(vanishing[:, None], of_triangles, neural_normals(phi, surface.uv))
 
 
 def by_normals(normals: np.ndarray) -> Callable[[Blend], np.ndarray]:

@@ -6,8 +6,10 @@ import hashlib
 import json
 import os
 import tempfile
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,18 @@ import numpy as np
 PREPARATION_VERSION = 7
 
 
+def downloads() -> ModuleType:
+    """pooch, imported when needed, without tqdm's advice to notebooks on bars that it never draws
+    here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pooch
+    return pooch
+
+
 def cache_folder() -> Path:
     """The folder of prepared surfaces and downloaded meshes: ``NSM_CACHE``, or the user's cache."""
-    import pooch
-
-    return Path(os.environ.get("NSM_CACHE") or pooch.os_cache("nsm"))
+    return Path(os.environ.get("NSM_CACHE") or downloads().os_cache("nsm"))
 
 
 def preparation_key(vertices: np.ndarray, faces: np.ndarray, options: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from nsm.errors import NsmError
 from nsm.surfaces import bundled, shapes
-from nsm.surfaces.cache import cache_folder
+from nsm.surfaces.cache import cache_folder, downloads
 from nsm.surfaces.landmark_files import Marks, read_marks
 from nsm.surfaces.loading import error_in, load_mesh
 
@@ -199,8 +199,7 @@ def catalogue_landmarks(name: str) -> Marks:
 
 def _fetch(name: str, remote: _Remote) -> Path:
     """A file of the catalogue, downloaded and checked if it is not in the cache."""
-    import pooch
-
+    pooch = downloads()
     mirror = os.environ.get("NSM_MESH_URL")
     url = f"{mirror.rstrip('/')}/{remote.file}" if mirror else remote.url
     try:

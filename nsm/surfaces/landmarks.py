@@ -140,30 +140,6 @@ def check_places(given: np.ndarray, faces: np.ndarray, name: str, numbers: np.nd
             raise error_in(name, "not_on_surface", reason)
 
 
-def numbered(given: Landmarks, numbers: np.ndarray, name: str) -> Landmarks:
-    """Landmarks of a mesh file as those of its cleaned mesh.
-
-    Args:
-        given: of the file.
-        numbers: (V,) of the cleaned mesh's vertices in the file.
-        name: of the surface, the key of errors.
-
-    Raises:
-        NsmError: ``not_on_surface`` for a vertex that was removed, ``wrong_type`` for places, whose
-            triangles have other numbers once the mesh is cleaned.
-    """
-    if isinstance(given, np.ndarray):
-        if given.shape[1] == 4:
-            raise error_in(name, "wrong_type", "give vertices or points, not places in triangles")
-        return given
-    local = {vertex: k for k, vertex in enumerate(numbers.tolist())}
-    local[MISSING] = MISSING
-    for k, vertex in enumerate(given):
-        if vertex not in local:
-            raise error_in(name, "not_on_surface", f"landmark {k}, vertex {vertex}, is not on it")
-    return [local[vertex] for vertex in given]
-
-
 def check_equal_lengths(names: Sequence[str], lists: Sequence[Landmarks]) -> None:
     """Check that all surfaces have the same number of landmarks.
 

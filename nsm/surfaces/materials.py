@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from nsm.surfaces.gltf import FolderResolver, check_images, check_textures
 from nsm.surfaces.loading import check_file, error_in
@@ -60,6 +60,9 @@ def _decoded(data: bytes | Any, name: object) -> np.ndarray:
             raise ValueError("it has more than 8 bits for a colour")
         see_through = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
         pixels = np.asarray(picture.convert("RGBA" if see_through else "RGB"))
+    except UnidentifiedImageError as error:  # its own words name an object in memory
+        reason = "no image; give a PNG or JPEG file"
+        raise error_in(name, "unreadable_file", reason) from error
     except Exception as error:  # Pillow raises any exception on damaged files
         cause = " ".join(str(error).split())[:100] or type(error).__name__
         reason = f"not a readable image ({cause}); save it as PNG or JPEG"

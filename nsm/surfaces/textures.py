@@ -138,7 +138,8 @@ def _read(file: Path) -> _Read:
     the paints."""
     suffix = file.suffix.lower()
     if suffix not in _READERS:
-        reason = f"{suffix[1:].upper() or 'such'} files have no texture coordinates; use OBJ or GLB"
+        kind = f"{suffix[1:].upper()} files have" if suffix else "a model of the catalogue has"
+        reason = f"{kind} no texture coordinates; use an OBJ or GLB file"
         raise error_in(file, "missing_uv", reason)
     check_file(file, LARGEST_FILE)
     try:

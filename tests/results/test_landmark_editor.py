@@ -157,6 +157,15 @@ def test_the_command_begins_with_a_file_and_ends_without_an_error(
     run = here("landmarks", "a.obj", "b.obj", "--landmarks", "given.json", "--port", "0")
     assert run.returncode == 130 and run.stdout.startswith("pairs.json: http://127.0.0.1:")
     assert vertices(made[0]) == [(3, 6), (5, 8)]
+    (tmp_path / "a.vts").write_text("3 x\n5 y\n7 z\n")
+    (tmp_path / "b.vts").write_text("8 y\n6 x\n")  # z is still to be placed
+    words = ["landmarks", "a.obj", "b.obj", "--empty", "--port", "0"]
+    run = here(*words, "--landmarks", "a.vts", "b.vts")
+    assert run.returncode == 130 and vertices(made.pop()) == [(3, 6), (5, 8), (7, None)]
+    (tmp_path / "pairs.csv").write_text("name,a,b\nx,3,6\ny,5,8\n")
+    run = here(*words, "--landmarks", "pairs.csv")
+    assert run.returncode == 130
+    assert [mark.name for mark in made.pop().landmarks.landmarks] == ["x", "y"]
     run = here("landmarks", "a.obj", "b.obj", "b.obj", "--empty", "--port", "0")
     assert run.returncode == 130 and vertices(made[1]) == []
     found = CollectionProposal([np.array([[3, 6], [5, 8]])], [2.0], 0.1, 0, False)

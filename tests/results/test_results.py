@@ -14,7 +14,7 @@ from tiny import dome, results
 from torch import nn
 
 from nsm.config import compose_config
-from nsm.domains import Surface
+from nsm.domains import Surface, domain
 from nsm.domains.surface import as_it_lies
 from nsm.errors import NsmError
 from nsm.maps import NeuralMap
@@ -41,7 +41,7 @@ from nsm.results.evolution import extend_strip
 from nsm.results.files import as_json
 from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.pair_pictures import normals_picture
-from nsm.results.pictures import neural_normals
+from nsm.results.pictures import neural_normals, normals_at_vertices
 from nsm.results.render import UP_AXES, View, rasterise, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.surfaces.shapes import ring_mesh
@@ -394,6 +394,25 @@ def test_the_normals_of_a_network_are_those_of_its_surface():
     assert np.allclose(neural_normals(phi, np.zeros((3, 2))), [0, -1, 0])
     flat = Affine([1, 0, 0], [1, 0, 0], [0, 0, 0])
     assert np.allclose(neural_normals(flat, np.zeros((1, 2))), 0)
+
+
+def test_pictures_take_the_triangles_normals_where_the_jacobian_vanishes():
+    uv, faces = domain("disc").mesh(4)
+    surface = Surface.from_arrays(np.column_stack([uv, 0 * uv[:, 0]]), faces)
+    centre = int(np.linalg.norm(surface.uv, axis=1).argmin())
+    branch = surface.uv[centre]
+
+    class Squared(torch.nn.Module):  # z -> (z - c)^2, whose Jacobian is 0 at c
+        def value_and_jacobian(self, uv):
+            x, y = (uv - torch.as_tensor(branch)).T
+            zero = torch.zeros_like(x)
+            values = torch.stack([x * x - y * y, 2 * x * y, zero], dim=1)
+            rows = [torch.stack(r, dim=1) for r in ((2 * x, -2 * y), (2 * y, 2 * x), (zero, zero))]
+            return values, torch.stack(rows, dim=1)
+
+    phi = Squared()
+    assert np.allclose(neural_normals(phi, branch[None]), 0)
+    assert np.allclose(normals_at_vertices(phi, surface), [0, 0, 1])
 
 
 def test_pictures_of_normals_and_of_a_cycle_are_drawn(tmp_path):
