@@ -96,6 +96,8 @@ def test_other_cones_are_tried_where_the_map_is_not_good(right, monkeypatch):
     assert right.cones is None
     monkeypatch.setattr(module, "_GOOD", 0.0)
     monkeypatch.setattr(module, "_BETTER", 10.0)
+    monkeypatch.setattr(module, "_EXCHANGED", 0)
+    monkeypatch.setattr(module, "_SETS", 3)
     found = coarse_check(*SHAPES, (TIPS, TIPS))
     assert len(set(found.cones)) == 4 and found.energy == pytest.approx(right.energy, rel=0.2)
     numbers = 10 + np.arange(len(TIPS))

@@ -95,7 +95,9 @@ def test_the_walk_around_the_cut_passes_the_same_branches(pair):
 
 def test_landmarks_on_the_cut_have_the_same_places(pair):
     meshes, ids, _ = pair
-    surfaces = prepare_jointly(meshes, ids, domain="disc", seam="shortest", cache=False)
+    surfaces = prepare_jointly(
+        meshes, ids, domain="disc", parameterization="tutte", seam="shortest", cache=False
+    )
     matched = matched_landmarks(surfaces, ids)
     assert matched.on_boundary == 2 * (len(ENDS) - 1 + 4)
     p, q = (points[: matched.on_boundary] for points in matched.points)
