@@ -25,6 +25,8 @@ _ROUND = Round(0, 5, 30)
 _EXCHANGED = 8  # landmarks at most of which two are exchanged: pairs are many
 _STRAINED = 10.0  # energy of a strained map: then the landmarks at the cones are left out, too
 _GOOD = 7.0  # energy below which the map needs no change, whatever distances between landmarks say
+_SETS = 12  # sets of four at the cones that are tried, until a map is good
+_BETTER = 0.8  # share of the energy with the first set, from which on another one is taken
 # energies from which on landmarks are doubted as a whole; few are on like shapes met with less
 _FEW, _STRAINED_FEW, _STRAINED_MANY = 5, 16.0, 30.0
 # gains from which on a change is told. Measured, see docs/correspondence.md
@@ -61,11 +63,14 @@ class CoarseCheck:
         energy: mean symmetric Dirichlet energy of the map that meets all of them.
         changes: those that were tried.
         count: of the landmarks.
+        cones: four landmarks for the cones, where the map is much less distorted with these than
+            with those of which the surfaces' own layouts are distorted least; None elsewhere.
     """
 
     energy: float
     changes: list[Change]
     count: int
+    cones: tuple[int, ...] | None = None
 
     @property
     def best(self) -> Change | None:
@@ -94,7 +99,8 @@ class CoarseCheck:
             change._replace(landmarks=tuple(numbers[list(change.landmarks)].tolist()))
             for change in self.changes
         ]
-        return CoarseCheck(self.energy, changes, self.count)
+        cones = None if self.cones is None else tuple(numbers[list(self.cones)].tolist())
+        return CoarseCheck(self.energy, changes, self.count, cones)
 
 
 def coarse_check(
@@ -145,23 +151,51 @@ class _Maps:
         self.sets = self.sets[np.argsort(scores)]
 
     def check(self) -> CoarseCheck | None:
-        four = self.sets[0]
-        everything = np.arange(self.count)
-        given = _Trial(None, everything, everything)
-        free = np.setdiff1d(everything, four)
-        trials = [given, _Trial(("mirrored", ()), everything, everything)]
-        trials += [self._without(k) for k in free.tolist()]
-        if self.count <= _EXCHANGED:
-            trials += list(self._exchanges(four))
-        energies = self._energies(four, trials)
-        if energies is None:
+        four, cones = self.sets[0], None
+        found = self._trials(four)
+        if found is None:
             return None
+        if found[1][0] > _GOOD:
+            # cones tell the isotopy classes that are tried; the right one may not be among these
+            other = self._better(found[1][0])
+            changed = None if other is None else self._trials(other)
+            if other is not None and changed is not None:
+                four, found, cones = other, changed, tuple(other.tolist())
+        trials, energies = found
         before = energies[0]
         changes = _changes(before, trials[1:], energies[1:])
         if before > _STRAINED:
             changes += self._without_cones(before, four)
             changes += self._worst_exchanged(before, changes)
-        return CoarseCheck(before, changes, self.count)
+        return CoarseCheck(before, changes, self.count, cones)
+
+    def _trials(self, four: np.ndarray) -> tuple[list[_Trial], list[float]] | None:
+        """The map through all landmarks, first, and the changes, with cones at four landmarks."""
+        everything = np.arange(self.count)
+        free = np.setdiff1d(everything, four)
+        trials = [self._through_all, _Trial(("mirrored", ()), everything, everything)]
+        trials += [self._without(k) for k in free.tolist()]
+        if self.count <= _EXCHANGED:
+            trials += list(self._exchanges(four))
+        energies = self._energies(four, trials)
+        return None if energies is None else (trials, energies)
+
+    @property
+    def _through_all(self) -> _Trial:
+        everything = np.arange(self.count)
+        return _Trial(None, everything, everything)
+
+    def _better(self, energy: float) -> np.ndarray | None:
+        """The four landmarks (4,) for the cones with which the map through all of them is much less
+        distorted than with the first set; None if there are none."""
+        best, found = _BETTER * energy, None
+        for four in self.sets[1:_SETS]:
+            energies = self._energies(four, [self._through_all])
+            if energies is not None and energies[0] < best:
+                best, found = energies[0], four
+            if best < _GOOD:
+                break
+        return found
 
     def _without(self, k: int) -> _Trial:
         everything = np.arange(self.count)

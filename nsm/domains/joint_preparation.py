@@ -62,6 +62,7 @@ def prepare_jointly(
     seam: str = "auto",
     seam_landmarks: int | None = None,
     cache: bool = True,
+    cones: Sequence[int] | None = None,
     repairs: Repairs = NO_DECISION,
     processes: int | None = 1,
 ) -> list[Surface]:
@@ -82,6 +83,8 @@ def prepare_jointly(
             ``own``: each mesh is cut by itself, around its landmarks.
         seam_landmarks: how many landmarks, mutually far ones, the seam passes through; by default
             all of them, or, with ``auto``, the number for which the domains agree best.
+        cones: numbers of the four landmarks for the cones of the orbifold, which all meshes have;
+            chosen by default.
         processes: how many meshes are laid out at once, as for
             :func:`nsm.side_by_side.side_by_side`.
 
@@ -140,6 +143,7 @@ def prepare_jointly(
         "method": parameterization,
         "seam": [seam, seam_landmarks],
         "repairs": asdict(repairs),
+        **({} if cones is None else {"cones": list(cones)}),
     }
     # keys of the files: meshes that are equal once cleaned may still differ in vertex numbers
     names = [cache_.preparation_key(m.vertices, m.faces, options) for m in meshes]
@@ -156,7 +160,8 @@ def prepare_jointly(
         how = (domain, parameterization, seam, seam_landmarks)
         one, parts = _cut_alike(meshes, cleaned, found, everywhere, *how, number)
     else:
-        one, parts = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization)
+        four = None if cones is None else (np.cumsum(everywhere) - 1)[list(cones)]
+        one, parts = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization, four)
     surfaces = _laid_out(one, parts, processes)
     if cache:
         for key, surface in zip(names, surfaces, strict=True):
@@ -183,9 +188,11 @@ def _with_common_cones(
     landmarks: Sequence[np.ndarray],
     domain: Domain,
     method: str,
+    four: np.ndarray | None,
 ) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
     """What lays out a mesh, and its arguments for each."""
-    numbers, score = choose_common_cones([(c.vertices, c.faces) for c in cleaned], landmarks)
+    arrays = [(c.vertices, c.faces) for c in cleaned]
+    numbers, score = choose_common_cones(arrays, landmarks, four)
     line = (
         f"cones at landmarks {numbers.tolist()}, counted from 0, the same on all meshes: mean log "
         f"distortion {score:.3f}"

@@ -53,6 +53,13 @@ class LandmarkCheck:
         return {**known, "landmarks_doubtful": self.warning is not None}
 
     @property
+    def cones(self) -> tuple[int, ...] | None:
+        """The landmarks for the cones of two surfaces, where coarse maps prefer others than the
+        surfaces' own layouts do (see :class:`nsm.correspondence.coarse_check.CoarseCheck`)."""
+        only = list(self.coarse.values())
+        return only[0].cones if len(self.names) == 2 and only else None
+
+    @property
     def warning(self) -> Text | None:
         """One line in red, which names the landmark that fits least; None if there is no doubt.
 

@@ -45,7 +45,9 @@ from nsm.results import (
     reliability_picture,
     transfer_picture,
     warning_of_distortion,
+    warning_of_folds,
     warning_of_missed_landmarks,
+    warning_of_no_landmarks,
     warning_of_tears,
     write_correspondences,
     write_reliability,
@@ -114,7 +116,8 @@ class PairMapTask(Task):
         self.attributes = read_attributes(settings["attributes"], counts)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
         draw = partial(draw_landmarks, self.folder, landmarks=ids)
-        phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw)
+        cones = None if self.check is None or self.domain.has_boundary else self.check.cones
+        phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw, cones)
         self.use(phi, psi, ids)
 
     def use(self, phi: NeuralSurface, psi: NeuralSurface, ids: Sequence[np.ndarray]) -> None:
@@ -250,6 +253,8 @@ class PairMapTask(Task):
         result.metrics.update(result.certificate)
         for known in (self.proposed, self.check):
             result.metrics.update({} if known is None else known.figures)
+        if self._chosen_by_distortion:
+            result.metrics["landmarks_sure"] = False
         if self.trained is not None:
             before = flipped_percent(self.trained.image_uv[source.of_part], source.part.faces)
             result.metrics["flipped_before_repair_percent"] = before
@@ -258,12 +263,19 @@ class PairMapTask(Task):
         if len(source.seam_pairs) and source.domain.has_boundary:
             result.metrics.update(result.weld.figures(target.bounding_box_diagonal))
 
+    @property
+    def _chosen_by_distortion(self) -> bool:
+        """Whether nothing but the distortion says which part of a mesh goes to which."""
+        return not len(self.ids[0]) and not isinstance(self.psi.map, AnalyticSurface)
+
     def warnings(self, result: SurfaceMap) -> list[Text]:
         name = f"{self.surface.name} → {self.psi.surface.name}"
         found = (
             None if self.proposed is None else self.proposed.warning,
             None if self.check is None else self.check.warning,
+            warning_of_no_landmarks(name) if self._chosen_by_distortion else None,
             warning_of_distortion({name: result.metrics}),
+            warning_of_folds({name: result.metrics}),
             warning_of_missed_landmarks({name: result.metrics}),
             warning_of_tears(name, result.metrics),
         )

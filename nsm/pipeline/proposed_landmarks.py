@@ -198,7 +198,11 @@ def given_or_proposed(
             return list(shapes), ids, None
     if len(ids[0]) >= _ENOUGH and not settings.alternative:
         if not found.sure:
-            console.print(f"{found.said}; only those given are taken", soft_wrap=True)
+            console.print(
+                f"landmarks: {len(ids[0])} given are kept; no others are sure enough to come to "
+                "them",
+                soft_wrap=True,
+            )
         if not (found.sure and found.added):
             return list(shapes), ids, None
     if settings.strict and not found.sure:

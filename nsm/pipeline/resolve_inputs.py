@@ -157,6 +157,7 @@ def neural_surfaces(
     landmarks: Sequence[np.ndarray],
     console: Console,
     shown: Callable[[list[Surface]], None] = lambda _: None,
+    cones: Sequence[int] | None = None,
 ) -> list[NeuralSurface]:
     """Neural surfaces of the shapes; those that are meshes are prepared jointly, and overfitted.
 
@@ -166,6 +167,7 @@ def neural_surfaces(
         landmarks: vertices (L,) of each.
         console: where to print.
         shown: is given all surfaces, checked and laid out, before any network is trained.
+        cones: as for :func:`nsm.domains.joint_preparation.prepare_jointly`.
 
     Raises:
         NsmError: a mesh that cannot be prepared.
@@ -183,6 +185,7 @@ def neural_surfaces(
                 seam=config.seam.path,
                 seam_landmarks=config.seam.landmarks,
                 cache=config.surface.cache,
+                cones=None if alone else cones,
                 repairs=configured_repairs(config),
                 processes=config.phi.get("processes"),
             )

@@ -35,7 +35,9 @@ from nsm.results.tables import (
     metrics_table,
     pair_table,
     warning_of_distortion,
+    warning_of_folds,
     warning_of_missed_landmarks,
+    warning_of_no_landmarks,
     warning_of_tears,
 )
 from nsm.results.textured_mesh import TexturedMesh
@@ -69,7 +71,9 @@ __all__ = [
     "pair_table",
     "transfer_picture",
     "warning_of_distortion",
+    "warning_of_folds",
     "warning_of_missed_landmarks",
+    "warning_of_no_landmarks",
     "warning_of_tears",
     "NeuralSurface",
     "Parameterization",

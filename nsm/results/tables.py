@@ -63,6 +63,9 @@ _TORN = 1.0
 _DISTORTED = 12.0
 # percent of the diagonal by which a landmark may miss its place before it is said
 _MISSED = 5.0
+# percent of triangles folded before the repair from which on it is said: good maps have 0.4 at
+# most, those that landmarks pull to the wrong side of others 1 to 30
+_FOLDED = 1.0
 
 _PAIR_ROWS = {
     "symmetric_dirichlet_median": (
@@ -145,6 +148,39 @@ def warning_of_missed_landmarks(maps: Mapping[str, Mapping[str, float]]) -> Text
         f"({maps[worst]['landmark_error_mean_percent']:.1f} % in the mean): landmarks contradict "
         "each other, or the training was too short",
         style="bold red",
+    )
+
+
+def warning_of_folds(maps: Mapping[str, Mapping[str, float]]) -> Text | None:
+    """A line in red, if a map had more folds before its repair than good maps have; None if none
+    had.
+
+    Args:
+        maps: as for :func:`warning_of_distortion`.
+    """
+    key = "flipped_before_repair_percent"
+    which, worst = _beyond(maps, key, _FOLDED)
+    if not which:
+        return None
+    return Text(
+        f"{which}: {maps[worst][key]:.1f} % of the triangles were folded before the repair, which "
+        "hardly happens in right maps: parts may go to wrong places. Check the landmarks in "
+        "landmarks.png, or give more of them",
+        style="bold red",
+    )
+
+
+def warning_of_no_landmarks(name: str) -> Text:
+    """A line for a map of meshes that nothing but its distortion has chosen.
+
+    Args:
+        name: of the map.
+    """
+    return Text(
+        f"WARNING: {name}: without landmarks, this is the least distorted of the maps that were "
+        "tried, and NOT SURE to take parts to those that correspond; look at transfer.png, and "
+        "give landmarks if it does not",
+        style="yellow",
     )
 
 

@@ -11,7 +11,11 @@ import nsm
 from nsm.correspondence import agreement
 from nsm.domains.joint_preparation import Mesh
 from nsm.pipeline.landmark_check import check_landmarks
-from nsm.results import warning_of_distortion, warning_of_missed_landmarks
+from nsm.results import (
+    warning_of_distortion,
+    warning_of_folds,
+    warning_of_missed_landmarks,
+)
 from nsm.results.report.runs import find_runs
 from nsm.surfaces.shapes import hemisphere, ring_mesh, sphere
 
@@ -156,3 +160,9 @@ def test_a_missed_landmark_is_told():
     assert warning_of_missed_landmarks({"a → b": {**off, "landmark_error_max_percent": 1}}) is None
     said = warning_of_missed_landmarks({"a → b": {}, "b → a": off}).plain
     assert "1 of 2 maps, b → a most" in said and "40.0 %" in said and "11.0 %" in said
+
+
+def test_folds_before_the_repair_are_told_from_one_percent_on():
+    key = "flipped_before_repair_percent"
+    assert warning_of_folds({"a → b": {}, "b → a": {key: 0.4}}) is None
+    assert "b → a" in warning_of_folds({"a → b": {}, "b → a": {key: 4.2}}).plain

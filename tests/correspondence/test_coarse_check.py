@@ -1,5 +1,7 @@
 """Landmarks judged by coarse maps: which change of them is told, and when nothing is."""
 
+import importlib
+
 import numpy as np
 import pytest
 from limbs import star
@@ -7,9 +9,11 @@ from rich.console import Console
 
 from nsm.correspondence import Agreement, CoarseCheck, CommonAgreement, coarse_check
 from nsm.domains.joint_preparation import Mesh
+from nsm.domains.orbifold.common_cones import choose_common_cones
 from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks
 from nsm.surfaces.shapes import hemisphere
 
+module = importlib.import_module("nsm.correspondence.coarse_check")  # a function has its name
 V, F, TIPS = star([1.5, 1.2, 0.9, 1.0, 1.4])
 W, _, _ = star([1.3, 1.3, 1.0, 0.8, 1.5])  # the same tips
 SHAPES = (V, F), (W, F)
@@ -85,3 +89,20 @@ def test_the_line_names_landmark_and_vertices_also_where_others_are_missing():
     assert f"landmark 3 (vertex {ours[3]} of a, {theirs[3]} of b)" in check.warning.plain
     assert check.warning.plain in console.export_text()
     assert check.figures["landmarks_doubtful"]
+
+
+def test_other_cones_are_tried_where_the_map_is_not_good(right, monkeypatch):
+    """With thresholds at which any other set is taken, the best of the others is."""
+    assert right.cones is None
+    monkeypatch.setattr(module, "_GOOD", 0.0)
+    monkeypatch.setattr(module, "_BETTER", 10.0)
+    monkeypatch.setattr(module, "_EXCHANGED", 0)
+    monkeypatch.setattr(module, "_SETS", 3)
+    found = coarse_check(*SHAPES, (TIPS, TIPS))
+    assert len(set(found.cones)) == 4 and found.energy == pytest.approx(right.energy, rel=0.2)
+    numbers = 10 + np.arange(len(TIPS))
+    assert found.numbered(numbers).cones == tuple(10 + k for k in found.cones)
+    check = LandmarkCheck(["a", "b"], [TIPS, TIPS], None, {1: found})
+    assert check.cones == found.cones
+    four = choose_common_cones(SHAPES, [TIPS, TIPS], found.cones)[0]
+    assert sorted(four.tolist()) == sorted(found.cones)

@@ -22,7 +22,7 @@ Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def choose_common_cones(
-    meshes: Sequence[Mesh], landmarks: Sequence[np.ndarray]
+    meshes: Sequence[Mesh], landmarks: Sequence[np.ndarray], four: Sequence[int] | None = None
 ) -> tuple[np.ndarray, float]:
     """Four landmarks that, as cones of all surfaces, make domains of little distortion.
 
@@ -33,17 +33,18 @@ def choose_common_cones(
     Args:
         meshes: vertices (V, 3) and faces (F, 3) of closed meshes of genus 0.
         landmarks: corresponding vertices (L,) of each, at least four that differ.
+        four: numbers of the landmarks to take, of which the order is chosen alone.
 
     Returns:
         the landmarks' numbers (4,), in the order of (0, 0), (1, 0), (1, 1), (0, 1), and the mean
         over the surfaces of the mean logarithm of the distortion.
     """
-    kept = distinct(landmarks)
+    kept = distinct(landmarks) if four is None else np.asarray(four)
     places, distances = far_apart(meshes, [ids[kept] for ids in landmarks], _CANDIDATES)
     chosen = kept[places]
     closeness = -np.log(distances + np.eye(len(chosen)))
-    sets = [np.array(four) for four in combinations(range(len(chosen)), 4)]
-    sets.sort(key=lambda four: float(closeness[np.ix_(four, four)].sum()))
+    sets = [np.array(each) for each in combinations(range(len(chosen)), 4)]
+    sets.sort(key=lambda each: float(closeness[np.ix_(each, each)].sum()))
     own = [ids[chosen] for ids in landmarks]
     smaller = list(meshes)
     for k, (vertices, faces) in enumerate(meshes):
@@ -51,8 +52,8 @@ def choose_common_cones(
             coarse, ids = decimated(vertices, faces, LARGE // 2, own[k])
             smaller[k], own[k] = (vertices[ids], coarse), np.searchsorted(ids, own[k])
     # the best differ less than the surfaces' layouts on few and many faces: no second comparison
-    score, four, lattices = compared(smaller, own, sets[:_SETS], again=False)[0]
-    return chosen[four[_least_sheared(lattices)]], score
+    score, best, lattices = compared(smaller, own, sets[:_SETS], again=False)[0]
+    return chosen[best[_least_sheared(lattices)]], score
 
 
 def distinct(landmarks: Sequence[np.ndarray]) -> np.ndarray:
