@@ -1,6 +1,7 @@
 """The command: its first word, flags, and the answers to mistakes."""
 
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -107,6 +108,22 @@ def test_ctrl_c_is_answered_whenever_it_comes(here, tmp_path, monkeypatch):
     monkeypatch.setattr("nsm.pipeline.overfit.OverfitTask.prepare", stop)
     result = here(*TRAINING)
     assert (result.returncode, result.stderr) == (130, "nsm: interrupted\n")
+
+
+def test_ctrl_c_while_files_are_written_says_how_to_go_on(here, tmp_path, monkeypatch):
+    (tmp_path / "patch.off").write_text(SQUARE)
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("nsm.pipeline.overfit.OverfitTask.write_artefacts", stop)
+        result = here(*TRAINING, "artefacts=true", "hydra.run.dir=a run (1)")
+    assert (result.returncode, result.stderr) == (130, "")
+    _, _, command = result.stdout.strip().splitlines()[-1].partition("nsm ")
+    (word,) = shlex.split(command)
+    result = here(word)
+    assert result.returncode == 0 and (tmp_path / "a run (1)" / "metrics.json").exists()
 
 
 def test_the_settings_shown_are_those_of_the_run(here, tmp_path):

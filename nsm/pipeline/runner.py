@@ -19,7 +19,14 @@ from nsm.pipeline.checkpoints import CHECKPOINT_FILE
 from nsm.pipeline.folder_lock import folder_lock
 from nsm.pipeline.process_state import process_state
 from nsm.pipeline.task import Given, Task
-from nsm.pipeline.training import CONFIG_FILE, Run, check_device, stored_config, trained
+from nsm.pipeline.training import (
+    CONFIG_FILE,
+    Run,
+    check_device,
+    interrupted,
+    stored_config,
+    trained,
+)
 from nsm.results import atomic_write
 from nsm.results.callbacks import Pictures
 from nsm.results.divergence_guard import guard_of
@@ -122,7 +129,10 @@ def run_prepared(task: Task, run: Run, started: float) -> Any:
         (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
         module, data = built(task), task.build_data()
         trainer = trained([run], data, module, task.console, pictures_of(task), task.title)
-    return finish(task, run, module, trainer, started, data=data)
+    try:
+        return finish(task, run, module, trainer, started, data=data)
+    except KeyboardInterrupt as error:
+        raise interrupted([run], task.console) from error
 
 
 def run_parts(task: Task, parts: list[Task], run: Run, started: float) -> Any:

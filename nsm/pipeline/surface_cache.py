@@ -170,9 +170,9 @@ def _fill_side_by_side(
         with stage(console, f"neural surfaces of {titles}"):
             calls = [one(surface) for surface in missing.values()]
             every = side_by_side(calls, processes)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         console.print("interrupted; the same command goes on")
-        raise
+        raise KeyboardInterrupt("told") from error
     for surface, metrics in zip(missing.values(), every, strict=True):
         console.print(made_line(surface.name, metrics, metrics["seconds"]), soft_wrap=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,15 +218,21 @@ def trained(
         if trainer.state.status != "finished":
             close(trainer.loggers, "failed")
     if trainer.interrupted:
-        how = f"; go on with: nsm resume={folder}"
-        if len(runs) > 1 or runs[0].inner:  # of a sweep, or for a map
-            how = "; the same command goes on"
-        console.print(f"interrupted{'' if is_temporary(folder) else how}", soft_wrap=True)
-        raise KeyboardInterrupt("told")
+        raise interrupted(runs, console)
     if several:
         take_over(trainer, folder / CHECKPOINT_FILE)
         trainer.loggers = loggers(trainer.global_step + 1)
     return trainer
+
+
+def interrupted(runs: Sequence[Run], console: Console) -> KeyboardInterrupt:
+    """Say how an interrupted training, or what follows it, goes on."""
+    folder = runs[0].folder
+    how = f"; go on with: nsm {shlex.quote(f'resume={folder}')}"
+    if len(runs) > 1 or runs[0].inner:  # of a sweep, or for a map
+        how = "; the same command goes on"
+    console.print(f"interrupted{'' if is_temporary(folder) else how}", soft_wrap=True)
+    return KeyboardInterrupt("told")
 
 
 def lightning_trainer(
