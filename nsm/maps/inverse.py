@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from nsm.maps.composition import PointMap
@@ -62,6 +63,37 @@ def inverted(
     return x
 
 
+@torch.no_grad()
+def preimages(
+    h: nn.Module,
+    targets: Tensor,
+    nodes: Tensor,
+    project: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
+    """Points x (N, 2) with h(x) = targets (N, 2), wherever they lie.
+
+    Args:
+        h, targets, project: as for :func:`inverted`.
+        nodes: (M, 2); Newton's method starts from the few whose images under h are nearest to a
+            target, until one leads to it.
+    """
+    images = h(nodes)
+    tree = cKDTree(images.cpu().numpy())
+    _, near = tree.query(targets.cpu().numpy(), k=[*range(1, min(_STARTS, len(images)) + 1)])
+    starts = nodes[torch.as_tensor(near, device=nodes.device)]
+    result = inverted(h, targets, starts[:, 0], project)
+    off = (h(result) - targets).norm(dim=1)
+    for k in range(1, starts.shape[1]):
+        missed = (off > _ENOUGH).nonzero()[:, 0]
+        if len(missed) == 0:
+            break
+        other = inverted(h, targets[missed], starts[missed, k], project)
+        distance = (h(other) - targets[missed]).norm(dim=1)
+        better = distance < off[missed]
+        result[missed[better]], off[missed[better]] = other[better], distance[better]
+    return result
+
+
 class _Inverse(torch.autograd.Function):
     """x ↦ h_i⁻¹(x) of a :class:`TransitionMap`, differentiated by the inverse function theorem."""
 
@@ -97,8 +129,7 @@ class TransitionMap(nn.Module):
 
     Args:
         first, second: h_i and h_j, from the common domain.
-        nodes: (M, 2) points of the common domain; Newton's method starts from the few whose
-            images under h_i are nearest, until one leads to the point.
+        nodes: (M, 2) points of the common domain (see :func:`preimages`).
         project: from points (N, 2) to the nearest ones of the common domain, if h_i keeps to it.
     """
 
@@ -136,24 +167,6 @@ class TransitionMap(nn.Module):
             y = y - torch.linalg.solve(jacobian.detach(), change)[..., 0]
         return y
 
-    @torch.no_grad()
     def back(self, x: Tensor) -> Tensor:
         """h_i⁻¹: (N, 2) to points (N, 2) of the common domain."""
-        images = self.first(self.nodes)
-        near = torch.cat(
-            [
-                torch.cdist(part, images).topk(min(_STARTS, len(images)), largest=False).indices
-                for part in x.split(2048)
-            ]
-        )
-        result = inverted(self.first, x, self.nodes[near[:, 0]], self.project)
-        off = (self.first(result) - x).norm(dim=1)
-        for k in range(1, near.shape[1]):
-            missed = (off > _ENOUGH).nonzero()[:, 0]
-            if len(missed) == 0:
-                break
-            other = inverted(self.first, x[missed], self.nodes[near[missed, k]], self.project)
-            distance = (self.first(other) - x[missed]).norm(dim=1)
-            better = distance < off[missed]
-            result[missed[better]], off[missed[better]] = other[better], distance[better]
-        return result
+        return preimages(self.first, x, self.nodes, self.project)

@@ -197,6 +197,10 @@ class CollectionMapTask(Task):
             seam=torch.as_tensor(self._seam(), dtype=torch.float32),
             starts=self.starts,
             mesh=self._mesh(),
+            meshes=[
+                (torch.as_tensor(s.uv, dtype=torch.float32), torch.as_tensor(s.faces))
+                for s in (phi.surface for phi in self.phis)
+            ],
             diagonals=[phi.surface.bounding_box_diagonal for phi in self.phis],
             phis=[self.tabulated(phi) for phi in self.phis],
             names=names if len(set(names)) == len(names) else None,

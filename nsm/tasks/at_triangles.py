@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -22,7 +23,7 @@ class AtTriangles(Training):
         triangles_from: the step from which they count.
     """
 
-    quadrature: MeshQuadrature | None
+    quadrature: Any
     triangles_from: float
 
     def __init__(self) -> None:

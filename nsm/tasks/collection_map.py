@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.settings import CollectionConstraints
+from nsm.tasks.collection_quadrature import CollectionQuadrature, Turn
 from nsm.tasks.constrained import ConstrainedMap
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier, Folds
@@ -46,6 +47,7 @@ class CollectionMap(ConstrainedMap):
         starts: where each h_i starts, a rotation or, on a closed domain, an affine map: maps around
             the identity.
         mesh: uv (V, 2), in the common domain, and faces (F, 3) of all surfaces together.
+        meshes: the same of each surface, in its own domain.
         diagonals: of each surface's bounding box, the units of the logged errors.
         phis: the surfaces; none is trained.
         names: of the surfaces, each its own, for the curves ``pairs/A_to_B``; None: their numbers.
@@ -74,14 +76,15 @@ class CollectionMap(ConstrainedMap):
         seam: Tensor,
         starts: Sequence[Rotated | LatticeAligned],
         mesh: tuple[Tensor, Tensor],
+        meshes: Sequence[tuple[Tensor, Tensor]],
         diagonals: Sequence[float],
         phis: Sequence[nn.Module],
         loss_terms: dict[str, Any] | None = None,
         names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(domain, energy, loss_weights, constraints, max_steps, loss_terms)
-        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh", "names"]
-        self.save_hyperparameters(ignore=given, logger=False)
+        given = ["domain", "energy", "phis", "points", "targets", "seam", "starts", "mesh"]
+        self.save_hyperparameters(ignore=[*given, "meshes", "names"], logger=False)
         onto = domain if self.exact else None
         self.map = nn.ModuleList(
             start.around(planar_map(onto, map, activation, encoding)) for start in starts
@@ -94,6 +97,11 @@ class CollectionMap(ConstrainedMap):
         start = torch.stack([h.before(points) for h in self.map])  # type: ignore[operator]
         self.set_landmarks(points, targets, start, seam)
         self.folds_of = [Folds(held.injectivity) for _ in phis]
+        self.triangles_from = held.triangles_from * max_steps
+        if held.triangles_from < 1:
+            project = domain.project if domain.has_boundary and self.exact else None
+            self.quadrature = CollectionQuadrature(meshes, list(self.phis), project)
+        self._turn: Turn | None = None
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
         self.ordered = (i[i != j], j[i != j])
@@ -109,14 +117,14 @@ class CollectionMap(ConstrainedMap):
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         self.batch = batch
         w, ramp = self.loss_weights, self.ramp
-        pairs, scale = self._scales()
+        pairs, scale, share = self._scales()
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
         # sums over the surfaces
-        G = self._folding(evaluation.determinant)
+        G = self._folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0
-        U = self._triangle_term() if w.triangles > 0 else 0.0
+        U = self._triangle_term() if w.triangles > 0 and self._turn is None else 0.0
         C, multipliers = self.landmark_terms()
 
         loss = pairs * energy + scale * (
@@ -137,14 +145,16 @@ class CollectionMap(ConstrainedMap):
             "landmarks": (scale * self.landmark_weight, C),
         }
         for name, term in self.loss_terms.items():
-            terms[name] = (term.weight, term(evaluation))
-            loss = loss + term.weight * terms[name][1]
+            terms[name] = (share * term.weight, term(evaluation))
+            loss = loss + share * term.weight * terms[name][1]
         self.log_terms(loss, terms, distortion=energy)
         return loss
 
     def _evaluated(self, x: Tensor) -> tuple[Distortion, Evaluation]:
         """Energy of the ordered pairs at points (N, 2), and what it is made from, of each surface:
         tensors (k, N, ...)."""
+        if self.training and self._turn is not None:
+            return self._on_triangles(self._turn)
         forms, determinants, images, positions = (
             part.transpose(0, 1) for part in self.pointwise(self._at, x)
         )
@@ -154,11 +164,34 @@ class CollectionMap(ConstrainedMap):
         evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
         return Distortion(self.energy, parts, share[i]), evaluation
 
-    def _scales(self) -> tuple[int, float]:
-        """The weights of the mean over the pairs, and of the sums over the surfaces."""
+    def _on_triangles(self, turn: Turn) -> tuple[Distortion, Evaluation]:
+        """The same of the one map that moves: of its pairs, and tensors (1, F, ...)."""
+        some, phi = turn.some, self.phis[turn.number]
+        image = self.map[turn.number](some.uv)
+        position, sides = phi(image), some.sides(image)
+        metric = first_fundamental_form(some.sides(position))
+        parts = self.energy.parts(*turn.ends(metric), turn.at)
+        evaluation = Evaluation(
+            some.centres_on(image)[None],
+            some.centres_on(position)[None],
+            some.centres_on(image)[None],
+            source=metric[None],
+            determinant=(sides.det() / some.determinant)[None],
+            share=some.oriented[None],
+        )
+        return Distortion(self.energy, parts, turn.share), evaluation
+
+    def _scales(self) -> tuple[int, float, float]:
+        """The weights of the mean over the pairs, of the sums over the surfaces, and of means over
+        the surfaces.
+
+        In the turn of one map the loss is k/2 times the part that it has in L: its pairs are 2/k of
+        all, and their mean has the weight of the mean over all.
+        """
         k = len(self.map)
         summed = self.constraints.pairs == "sum"
-        return (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
+        pairs, scale = (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
+        return (pairs, scale, 1.0) if self._turn is None else (pairs, k / 2 * scale, 0.5)
 
     def _shares(self, forms: Tensor, images: Tensor) -> Tensor:
         """How much each sample counts for each source, (k, N).
@@ -171,9 +204,27 @@ class CollectionMap(ConstrainedMap):
             share = share * inside(self.domain, images).all(dim=0)
         return share
 
+    def turns(self) -> Iterator[nn.Module]:
+        """At samples all maps move at once, at triangles one after the other.
+
+        Moving all h_i alike changes no map between surfaces, and a metric that takes each h_i apart
+        holds against it. One map alone is that of a pair: the others say where it leads.
+        """
+        if self.quadrature is None or self.global_step < self.triangles_from:
+            yield self.map
+            return
+        try:
+            for i, h in enumerate(self.map):
+                self._turn = self.quadrature.turn(i, list(self.map))
+                yield h
+        finally:
+            self._turn = None
+
     def curvatures(self) -> list[Curvature]:
+        if self._turn is not None:
+            return self._curvatures_on_triangles(self._turn)
         x, w, k = self.batch, self.loss_weights, len(self.map)
-        pairs, scale = self._scales()
+        pairs, scale, _ = self._scales()
         step = self.global_step
         with torch.no_grad():
             images, inner = batched(list(self.map)).value_and_jacobian(x.expand(k, -1, -1))
@@ -193,14 +244,32 @@ class CollectionMap(ConstrainedMap):
                 total = total + share[i] * to + share[other] * back
             return total
 
-        of_landmarks = 2 * scale * self.landmark_weight * torch.eye(2).to(x)
         found = []
-        for i, h in enumerate(self.map):
+        for i, (h, phi) in enumerate(zip(self.map, self.phis, strict=True)):
             found.append(Curvature(h, x, positive_hessians(partial(energy, i), inner[i])))
-            if len(self.points):
-                each = self.there[i].to(x)[:, None, None] * of_landmarks
-                found.append(Curvature(h, self.points, each))
+            found += self.constraint_curvatures(h, phi, self.there[i], scale)
         return found
+
+    def _curvatures_on_triangles(self, turn: Turn) -> list[Curvature]:
+        some, i, step = turn.some, turn.number, self.global_step
+        h, phi, x = self.map[i], self.phis[i], some.centres
+        pairs, scale, _ = self._scales()
+        with torch.no_grad():
+            image, jacobian = h.value_and_jacobian(x)  # type: ignore[operator]
+            outer = phi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
+            determinant = some.sides(h(some.uv)).det() / some.determinant
+            excess = (determinant - torch.linalg.det(jacobian)).double()
+        share = pairs * turn.share.double() / turn.share.sum()
+        folding = scale * self.loss_weights.injectivity * some.oriented.double()
+
+        def loss(j: Tensor) -> Tensor:
+            ends = turn.ends(first_fundamental_form(outer @ j))
+            values = share * self.energy.total(self.energy.parts(*ends, turn.at))
+            folds = self.folds_of[i](torch.linalg.det(j) + excess, step, smooth=True)
+            return (folding * folds).index_add(0, turn.of, values)
+
+        found = [Curvature(h, x, positive_hessians(loss, jacobian))]
+        return found + self.constraint_curvatures(h, phi, self.there[i], scale)
 
     def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A_i (N, k, 2, 2), det J_h (N, k), h (N, k, 2) and φ∘h (N, k, 3) of all surfaces at points
@@ -225,9 +294,12 @@ class CollectionMap(ConstrainedMap):
         )
         return ((a - b) ** 2).sum(dim=-1).mean(dim=1).sum()
 
-    def _folding(self, determinants: Tensor) -> Tensor:
-        """Σ over surfaces of G at their samples, det J_h (k, N)."""
-        both = zip(self.folds_of, determinants, strict=True)
+    def _folding(self, e: Evaluation) -> Tensor:
+        """Σ over surfaces of G at their samples, det J_h (k, N); or that of the map that moves."""
+        if e.share is not None and self._turn is not None:
+            folds = self.folds_of[self._turn.number]
+            return (e.share * folds(e.determinant[0], self.global_step, smooth=True)).sum()
+        both = zip(self.folds_of, e.determinant, strict=True)
         return torch.stack([folds(det, self.global_step).mean() for folds, det in both]).sum()
 
     def _triangle_term(self) -> Tensor:

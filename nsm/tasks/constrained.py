@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from nsm.energies import inside, landmark
+from nsm.energies import first_fundamental_form, inside, landmark
 from nsm.settings import PairConstraints, PairWeights
 from nsm.tasks.at_triangles import AtTriangles
+from nsm.tasks.curvature import Curvature
 from nsm.tasks.fold_barrier import further_training, stronger
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 
@@ -74,6 +75,7 @@ class ConstrainedMap(AtTriangles):
         self.constraints = self.Constraints(**constraints)
         self.loss_terms = made_terms(loss_terms or {})
         self.held_out = HeldOut()
+        self.weighed = 0.0  # λ_C of the step that is made
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
         # h maps Ω to itself by construction
@@ -114,6 +116,7 @@ class ConstrainedMap(AtTriangles):
         move on the ramp, over the landmarks that there are; 0.0 where there are none."""
         if not len(self.points):
             return 0.0, 0.0
+        self.weighed = self.landmark_weight
         moved = self(self.points)
         wanted = self.targets
         if self.constraints.ramp_of == "targets":
@@ -124,6 +127,30 @@ class ConstrainedMap(AtTriangles):
             multipliers = (self.multipliers * (moved - wanted)).sum()
         return C, multipliers
 
+    def constraint_curvatures(
+        self, h: nn.Module, surface: nn.Module, there: Tensor, scale: float = 1.0
+    ) -> list[Curvature]:
+        """Those of the terms C and S of one map.
+
+        Args:
+            h: the map.
+            surface: where it leads to.
+            there: (K,), which landmarks are.
+            scale: factor of both terms.
+        """
+        found = []
+        if len(self.points):
+            of_landmarks = 2 * scale * self.landmark_weight * torch.eye(2).to(self.points)
+            found.append(Curvature(h, self.points, there[:, None, None] * of_landmarks))
+        if len(self.seam) and self.loss_weights.seam > 0:
+            ends = self.seam.reshape(-1, 2)
+            with torch.no_grad():
+                tangents = surface.value_and_jacobian(h(ends))[1]  # type: ignore[operator]
+            # of both ends of a gap alone, without the product of the two
+            gap = 2 * scale * self.ramp * self.loss_weights.seam / len(self.seam)
+            found.append(Curvature(h, ends, gap * first_fundamental_form(tangents)))
+        return found
+
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         held = self.constraints
         if held.landmarks != "augmented" or not len(self.points) or self.ramp < 1:
@@ -132,11 +159,10 @@ class ConstrainedMap(AtTriangles):
             return
         # at triangles a step is far longer, and nearer to the minimum
         every = 1 if self.global_step > self.triangles_from else held.multiplier_every
-        weight = self.landmark_weight  # that of the next step
         if self.global_step % every == 0:
             with torch.no_grad():
                 off = self(self.points) - self.targets
-                self.multipliers += 2 * weight * off * self.there[..., None]
+                self.multipliers += 2 * self.weighed * off * self.there[..., None]
 
     def strengthen(self, steps: int) -> None:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from nsm.energies import At, first_fundamental_form
 
 _AT_ONCE = 8192
-_ALL = 65_536
+MOST = 65_536  # triangles of a mesh that are all taken
 _THIN = 1e-4  # height of a triangle in Ω
 
 
@@ -83,7 +83,7 @@ class MeshQuadrature(nn.Module):
         self.register_buffer("uv", uv, persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self._surface = [surface]  # not a part of this module
-        self._taken: tuple[int, Triangles] | None = None
+        self._taken: tuple[tuple[int, int], Triangles] | None = None
 
     @property
     def surface(self) -> Any:
@@ -94,27 +94,28 @@ class MeshQuadrature(nn.Module):
         return {**self.__dict__, "_taken": None}
 
     @torch.no_grad()
-    def take(self, count: int = _ALL) -> Triangles:
-        """All triangles; of a mesh with more than 65,536, those in the middle of ``count`` parts
+    def take(self, count: int = MOST, most: int = MOST) -> Triangles:
+        """All triangles; of a mesh with more than ``most``, those in the middle of ``count`` parts
         of equal area, if these are fewer."""
-        if self._taken is not None and self._taken[0] == count:
+        if self._taken is not None and self._taken[0] == (count, most):
             return self._taken[1]
         points = torch.cat([self.surface(part) for part in self.uv.split(_AT_ONCE)])
-        whole = _triangles(self.uv, self.faces, points)
-        if count < len(self.faces) > _ALL:
+        whole = triangles(self.uv, self.faces, points)
+        if count < len(self.faces) > most:
             ends = whole.share.double().cumsum(0)
             middles = (torch.arange(count, device=ends.device).double() + 0.5) / count * ends[-1]
             found, times = torch.searchsorted(ends, middles).unique_consecutive(return_counts=True)
             found = found.clamp(max=len(self.faces) - 1)
             rows, faces = self.faces[found].unique(return_inverse=True)
-            part = _triangles(self.uv[rows], faces, points[rows])
+            part = triangles(self.uv[rows], faces, points[rows])
             share = times.to(part.share) / count
             whole = part._replace(share=share, oriented=share * (part.oriented > 0))
-        self._taken = count, whole
+        self._taken = (count, most), whole
         return whole
 
 
-def _triangles(uv: Tensor, faces: Tensor, points: Tensor) -> Triangles:
+def triangles(uv: Tensor, faces: Tensor, points: Tensor) -> Triangles:
+    """Those with corners uv (V, 2) in Ω and points (V, 3) of the surface, faces (F, 3)."""
     some = Triangles(uv, faces, points, uv, uv, uv, uv)
     metric = first_fundamental_form(some.sides(points))
     area = torch.linalg.det(metric.double()).clamp(min=0).sqrt()

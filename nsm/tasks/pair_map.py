@@ -170,18 +170,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         if self.caps is not None:
             step = self.global_step
             found.append(self.caps.curvature(self.map, self.psi, self.energy, w.injectivity, step))
-        if len(self.points):
-            of_landmarks = 2 * self.landmark_weight * torch.eye(2).to(uv)
-            found.append(
-                Curvature(self.map, self.points, of_landmarks.expand(len(self.points), 2, 2))
-            )
-        if len(self.seam) and w.seam > 0:
-            ends = self.seam.reshape(-1, 2)
-            with torch.no_grad():
-                tangents = self.psi.value_and_jacobian(self.map(ends))[1]  # type: ignore[operator]
-            # of both ends of a gap alone, without the product of the two
-            gap = 2 * self.ramp * w.seam / len(self.seam) * first_fundamental_form(tangents)
-            found.append(Curvature(self.map, ends, gap))
+        found += self.constraint_curvatures(self.map, self.psi, self.there)
         return found
 
     def _boundary_term(self, image: Tensor) -> Tensor:

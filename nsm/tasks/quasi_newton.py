@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsm.maps import SplineField
@@ -93,13 +93,24 @@ class QuasiNewton(Optimizer):
                     Level(field, cells)  # says what is wrong
         self.iterations, self.memory, self.smoothing = iterations, memory, smoothing
         self.curvatures: Callable[[], Sequence[Curvature]] = lambda: []
+        self.turns: Callable[[], Iterable[nn.Module]] = lambda: [nn.ModuleList(fields)]
         fresh = not any(f.coefficients.detach().count_nonzero() for f in fields)
         self.state[self.fields[0].coefficients]["step"] = 0 if fresh else sum(steps)
         self._level: tuple[int, list[Level]] | None = None
+        self._moving: list[tuple[SplineField, Level]] = []
 
-    def watch(self, curvatures: Callable[[], Sequence[Curvature]]) -> None:
-        """Take the function that gives the curvature of the loss as it was last evaluated."""
-        self.curvatures = curvatures
+    def watch(
+        self,
+        curvatures: Callable[[], Sequence[Curvature]],
+        turns: Callable[[], Iterable[nn.Module]],
+    ) -> None:
+        """Take the functions that say what a step minimizes.
+
+        Args:
+            curvatures: gives the curvature of the loss as it was last evaluated.
+            turns: gives what a step moves, one part after the other: modules with fields.
+        """
+        self.curvatures, self.turns = curvatures, turns
 
     @property
     def converged(self) -> bool:
@@ -113,13 +124,13 @@ class QuasiNewton(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """The iterations of a step.
+        """The iterations of a step, of each part that takes its turn.
 
         Args:
             closure: evaluates loss and gradients at the present coefficients.
 
         Returns:
-            The loss after the step.
+            The loss after the step, as the last part sees it.
         """
         assert closure is not None, "L-BFGS evaluates the loss more than once in a step"
         state = self.state[self.fields[0].coefficients]
@@ -127,16 +138,28 @@ class QuasiNewton(Optimizer):
         if self._level is None or self._level[0] != number:
             self._level = number, [Level(f, self.levels[number]) for f in self.fields]
         state["step"] += 1
-        at = np.concatenate(
-            [
-                level.restored(_array(f.coefficients)).ravel()
-                for level, f in zip(self._level[1], self.fields, strict=True)
-            ]
-        )
-        found = self._evaluated(closure, at)
-        if found is None:  # rolled back from a loss that is not finite
-            return None
-        before, known = found.value, self.curvatures()
+        loss, hardly = None, True
+        for part in self.turns():
+            own = [module for module in part.modules() if isinstance(module, SplineField)]
+            each = zip(self.fields, self._level[1], strict=True)
+            self._moving = [(field, level) for field, level in each if field in own]
+            before = self._evaluated(closure, self._now())
+            after = None if before is None else self._descended(closure, before)
+            if before is None or after is None:  # rolled back from a loss that is not finite
+                return None
+            hardly &= before.value - after.value <= _CONVERGED * abs(before.value)
+            loss = after.loss
+        state["converged"] = number == len(self.counts) and hardly
+        return loss
+
+    def _now(self) -> np.ndarray:
+        """The present coefficients on the level, of what moves."""
+        each = [level.restored(_array(field.coefficients)) for field, level in self._moving]
+        return np.concatenate([c.ravel() for c in each])
+
+    def _descended(self, closure: Callable[[], Any], found: _Found) -> _Found | None:
+        """What is found after the iterations, from what is found at the present coefficients."""
+        at, known = self._now(), self.curvatures()
         search = _Search(self.memory, self._metric(known), bool(known))
         for _ in range(self.iterations):
             moved = self._searched(closure, search, at, found)
@@ -145,23 +168,20 @@ class QuasiNewton(Optimizer):
             at, found, stuck = moved
             if stuck and not search.forget():
                 break
-        gained = before - found.value
-        last = number == len(self.counts)
-        state["converged"] = last and gained <= _CONVERGED * abs(before)
-        return found.loss
+        return found
 
     def _evaluated(self, closure: Callable[[], Any], at: np.ndarray) -> _Found | None:
         """Loss and gradient at coefficients of the level; None if the step was rolled back."""
-        assert self._level is not None
         self._put(at)
         with torch.enable_grad():
             loss = closure()
-        gradients = [f.coefficients.grad for f in self.fields if f.coefficients.grad is not None]
-        if loss is None or len(gradients) < len(self.fields):
+        gradients = [
+            f.coefficients.grad for f, _ in self._moving if f.coefficients.grad is not None
+        ]
+        if loss is None or len(gradients) < len(self._moving):
             return None
         value, parts = float(loss), []
-        each = zip(self._level[1], gradients, self._split(at), strict=True)
-        for level, g, c in each:
+        for (_, level), g, c in zip(self._moving, gradients, self._split(at), strict=True):
             rough = level.smoothness @ c
             value += self.smoothing * float((c * rough).sum())
             parts.append(level.up.T @ _array(g) + 2 * self.smoothing * rough)
@@ -188,16 +208,15 @@ class QuasiNewton(Optimizer):
 
     def _metric(self, known: Sequence[Curvature]) -> Callable[[np.ndarray], np.ndarray]:
         """The inverse of K on the level, at the present coefficients."""
-        assert self._level is not None
         matrices = [
             [level.floor + 2 * self.smoothing * level.smoothness] * level.out_dim
-            for level in self._level[1]
+            for _, level in self._moving
         ]
-        place = {id(field): k for k, field in enumerate(self.fields)}
+        place = {id(field): k for k, (field, _) in enumerate(self._moving)}
         for curvature in known:
             field, x, blocks = curvature.of_field()
             k = place[id(field)]
-            more = self._level[1][k].matrices(x, blocks)
+            more = self._moving[k][1].matrices(x, blocks)
             matrices[k] = [a + b for a, b in zip(matrices[k], more, strict=True)]
         metrics = [Metric(each) for each in matrices]
 
@@ -208,15 +227,13 @@ class QuasiNewton(Optimizer):
         return solve
 
     def _split(self, flat: np.ndarray) -> list[np.ndarray]:
-        """A vector of all fields' coefficients on the level, by field, each (rows, d)."""
-        assert self._level is not None
-        ends = accumulate(level.rows * level.out_dim for level in self._level[1])
+        """A vector of the coefficients on the level of what moves, by field, each (rows, d)."""
+        ends = accumulate(level.rows * level.out_dim for _, level in self._moving)
         parts = np.split(flat, list(ends)[:-1])
-        return [p.reshape(-1, f.out_dim) for p, f in zip(parts, self.fields, strict=True)]
+        return [p.reshape(-1, f.out_dim) for p, (f, _) in zip(parts, self._moving, strict=True)]
 
     def _put(self, at: np.ndarray) -> None:
-        assert self._level is not None
-        for field, level, c in zip(self.fields, self._level[1], self._split(at), strict=True):
+        for (field, level), c in zip(self._moving, self._split(at), strict=True):
             field.coefficients.copy_(torch.from_numpy(level.up @ c))
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.curvature import Curvature
@@ -74,10 +74,14 @@ class Training(Microbatching):
     def configure_optimizers(self) -> Any:
         configured = configure(self.map, self.hparams)
         if isinstance(configured["optimizer"], QuasiNewton):
-            configured["optimizer"].watch(self.curvatures)
+            configured["optimizer"].watch(self.curvatures, self.turns)
         return configured
 
     def curvatures(self) -> Sequence[Curvature]:
         """The curvature of the loss of the last training step by each planar map, for quasi-Newton
         steps; terms that say nothing of theirs are left out."""
         return []
+
+    def turns(self) -> Iterable[nn.Module]:
+        """What a quasi-Newton step moves, one part after the other while the rest is held."""
+        return [self.map]

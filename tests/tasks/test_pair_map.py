@@ -278,6 +278,7 @@ def collection(names, points=NONE, targets=None, seam=None, **changes):
         seam=torch.zeros(0, 2, 2) if seam is None else seam,
         starts=[start(torch.eye(2))] * k,
         mesh=MESH,
+        meshes=[MESH] * k,
         diagonals=[1.0] * k,
         phis=[surface(n) for n in names],
     )

@@ -234,7 +234,7 @@ def test_known_curvature_reaches_a_quadratic_minimum_at_once():
     x = points(400).float()
     wanted = x + 0.1 * torch.sin(3 * x.flip(1))
     identity = torch.eye(2).expand(400, 2, 2) * (2 / 400)
-    optimizer.watch(lambda: [Curvature(h, x, identity)])
+    optimizer.watch(lambda: [Curvature(h, x, identity)], lambda: [h])
 
     def closure():
         optimizer.zero_grad()

@@ -1,0 +1,114 @@
+"""The triangles of all surfaces of a collection, as one of its maps meets them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nsm.energies import At, first_fundamental_form
+from nsm.maps.inverse import preimages
+from nsm.tasks.mesh_quadrature import MOST, MeshQuadrature, Triangles, triangles
+
+_FOUND = 1e-6
+
+
+class Turn(NamedTuple):
+    """Where a collection is measured while one map h_i moves and the others are held.
+
+    The triangles are those of the meshes, each taken back to the common domain by its own
+    surface's map, as it was when the turn began. One of surface j counts for the maps from j, as it
+    does in figures; with h_i alone, these are the map to i or, for j = i, those to all others.
+
+    Attributes:
+        number: i.
+        some: F triangles in the common domain; their metric is that of their surface, their share
+            that of its area divided by the number of surfaces.
+        of: (M,) the triangle of each map of a triangle that h_i has a part in.
+        outward: (M,) whether that map begins at surface i.
+        held: (M, 2, 2) metric of its other end.
+        at: its beginning.
+    """
+
+    number: int
+    some: Triangles
+    of: Tensor
+    outward: Tensor
+    held: Tensor
+    at: At
+
+    @property
+    def share(self) -> Tensor:
+        """(M,) of the surface's area."""
+        return self.some.share[self.of]
+
+    def ends(self, metric: Tensor) -> tuple[Tensor, Tensor]:
+        """Metrics (M, 2, 2) of the maps' beginnings and ends, where A_i is ``metric`` (F, 2, 2)."""
+        own, held, outward = metric[self.of], self.held.to(metric), self.outward[:, None, None]
+        return torch.where(outward, own, held), torch.where(outward, held, own)
+
+
+class CollectionQuadrature(nn.Module):
+    """The meshes of k surfaces, all their triangles or, of more than 65,536, as many spread evenly.
+
+    Args:
+        meshes: uv (V, 2), in each surface's own domain, and faces (F, 3).
+        surfaces: φ_j.
+        project: from points to the nearest ones of the common domain, if maps keep to it.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[tuple[Tensor, Tensor]],
+        surfaces: Sequence[nn.Module],
+        project: Any = None,
+    ) -> None:
+        super().__init__()
+        both = zip(meshes, surfaces, strict=True)
+        self.each = nn.ModuleList(MeshQuadrature(*mesh, phi) for mesh, phi in both)
+        self.project = project
+
+    @torch.no_grad()
+    def turn(self, number: int, maps: Sequence[nn.Module]) -> Turn:
+        """That of the map of a surface.
+
+        Args:
+            number: of the surface.
+            maps: h_j, around affine maps.
+        """
+        each: Sequence[Any] = list(self.each)
+        few = sum(len(one.faces) for one in each) <= MOST
+        most = MOST if few else MOST // len(each)
+        parts = [one.take(most, most) for one in each]
+        corners = [self._taken_back(h, part.uv) for h, part in zip(maps, parts, strict=True)]
+        ends = torch.tensor([0, *(len(part.uv) for part in parts)]).cumsum(0).tolist()
+        faces = torch.cat([part.faces + n for part, n in zip(parts, ends[:-1], strict=True)])
+        some = triangles(torch.cat(corners), faces, torch.cat([part.points for part in parts]))
+        share = torch.cat([part.share for part in parts]) / len(parts)
+        known = some.uv.isfinite().all(dim=1)[faces].all(dim=1)
+        some = some._replace(
+            uv=some.uv.nan_to_num(), share=share * known, oriented=share * (some.oriented > 0)
+        )
+        owner = torch.cat(
+            [torch.full_like(p.share, j, dtype=torch.long) for j, p in enumerate(parts)]
+        )
+        inward, outward = (owner != number).nonzero()[:, 0], (owner == number).nonzero()[:, 0]
+        others = [j for j in range(len(parts)) if j != number]
+        own, x = parts[number], corners[number].nan_to_num()
+        images = [own.sides(each[j].surface(maps[j](x))) for j in others]
+        of = torch.cat([inward, *[outward] * len(others)])
+        held = [some.metric[inward], *(first_fundamental_form(sides) for sides in images)]
+        centres = torch.cat([part.centres for part in parts])
+        on_surfaces = torch.cat([part.centres_on(part.points) for part in parts])
+        at = At(centres[of], on_surfaces[of])
+        return Turn(number, some, of, owner[of] == number, torch.cat(held), at)
+
+    def _taken_back(self, h: Any, uv: Tensor) -> Tensor:
+        """h⁻¹ (V, 2), NaN where none is found."""
+        exact, targets = copy.deepcopy(h).cpu().double(), uv.cpu().double()
+        x = preimages(exact, targets, exact.back(targets), self.project)
+        off = (exact(x) - targets).norm(dim=1, keepdim=True)
+        return torch.where(off < _FOUND, x, torch.nan).to(uv)
