@@ -217,9 +217,10 @@ def write(lines: list[dict[str, Any]]) -> None:
     result: dict[str, Any] = {"cases": cases}
     head = (
         "| piece of | share | boundaries | into | landmarks | mean | within 0.05 | within 0.1 | "
-        "symmetric Dirichlet, median | 95th percentile | certified | seconds |"
+        "symmetric Dirichlet as h starts, median | 95th percentile | at the end, median | "
+        "95th percentile | flipped % before repair | certified | seconds |"
     )
-    rows = [head, "|" + "---|" * 12]
+    rows = [head, "|" + "---|" * 15]
     for line, case in zip(lines, cases, strict=True):
         off = np.array(line["errors"])
         within = [round(float((off <= s).mean()), 3) for s in SHARES]
@@ -227,8 +228,10 @@ def write(lines: list[dict[str, Any]]) -> None:
         rows.append(
             f"| {line['source']}, {line['cut']} | {line['share']} | {line['loops']} | "
             f"{line['target']} | {line['given']} | {line['mean']} | {within[0]} | {within[1]} | "
-            f"{line['median']} | {line['p95']} | {'yes' if line['certified'] else 'no'} | "
-            f"{line['seconds']} |"
+            f"{line['start_symmetric_dirichlet_median']:.2f} | "
+            f"{line['start_symmetric_dirichlet_p95']:.2f} | {line['median']} | {line['p95']} | "
+            f"{line['flipped_before_repair_percent']:.2f} | "
+            f"{'yes' if line['certified'] else 'no'} | {line['seconds']} |"
         )
     for kind in GIVEN:
         some = [line for line in lines if line["kind"] == kind]
