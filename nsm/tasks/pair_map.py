@@ -171,10 +171,8 @@ class PairMap(ConstrainedMap, OneMeshMap):
             step = self.global_step
             found.append(self.caps.curvature(self.map, self.psi, self.energy, w.injectivity, step))
         if len(self.points):
-            of_landmarks = 2 * self.landmark_weight * torch.eye(2).to(uv)
-            found.append(
-                Curvature(self.map, self.points, of_landmarks.expand(len(self.points), 2, 2))
-            )
+            of_landmarks = 2 * self.landmark_weight * self.held[:, None, None] * torch.eye(2).to(uv)
+            found.append(Curvature(self.map, self.points, of_landmarks))
         if len(self.seam) and w.seam > 0:
             ends = self.seam.reshape(-1, 2)
             with torch.no_grad():
