@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs bench bench-steps bench-maps bench-flattening bench-published bench-baselines bench-closed bench-correspondence bench-partial bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
+.PHONY: demo test check docs bench bench-steps bench-maps bench-flattening bench-published bench-baselines bench-closed bench-correspondence bench-partial bench-classes bench-activation bench-speed bench-waiting bench-scale torture fuzz clean
 
 demo: .venv/.nsm
 	$(BIN)/nsm task=overfit surface=terrain
@@ -66,6 +66,11 @@ bench-correspondence: .venv/.nsm-dev
 # it stopped. MESHES as above.
 bench-partial: .venv/.nsm-dev
 	$(BIN)/python benchmarks/partial.py $(if $(MESHES),--meshes $(MESHES))
+
+# Maps between two poses of 16 classes of shapes by formula, with many landmarks, two and none, as a
+# user runs them: an hour. It goes on where it stopped.
+bench-classes: .venv/.nsm-dev
+	$(BIN)/python benchmarks/classes.py
 
 # The sweep of activations, with close-ups and a report on the runs: a quarter of an hour.
 bench-activation: .venv/.nsm-dev

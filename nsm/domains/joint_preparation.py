@@ -188,7 +188,7 @@ def _with_common_cones(
     landmarks: Sequence[np.ndarray],
     domain: Domain,
     method: str,
-    four: np.ndarray | None,
+    four: Sequence[int] | None,
 ) -> tuple[Callable[..., Surface], list[tuple[Any, ...]]]:
     """What lays out a mesh, and its arguments for each."""
     arrays = [(c.vertices, c.faces) for c in cleaned]

@@ -247,7 +247,7 @@ class CollectionMap(ConstrainedMap):
         found = []
         for i, (h, phi) in enumerate(zip(self.map, self.phis, strict=True)):
             found.append(Curvature(h, x, positive_hessians(partial(energy, i), inner[i])))
-            found += self.constraint_curvatures(h, phi, self.there[i], scale)
+            found += self.constraint_curvatures(h, phi, self.held[i], scale)
         return found
 
     def _curvatures_on_triangles(self, turn: Turn) -> list[Curvature]:
@@ -269,7 +269,7 @@ class CollectionMap(ConstrainedMap):
             return (folding * folds).index_add(0, turn.of, values)
 
         found = [Curvature(h, x, positive_hessians(loss, jacobian))]
-        return found + self.constraint_curvatures(h, phi, self.there[i], scale)
+        return found + self.constraint_curvatures(h, phi, self.held[i], scale)
 
     def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """A_i (N, k, 2, 2), det J_h (N, k), h (N, k, 2) and φ∘h (N, k, 3) of all surfaces at points

@@ -20,6 +20,9 @@ _ON_BOUNDARY = 1e-6
 _FIRST = 1e-3
 # factor of λ_C at triangles, where few steps are left to meet the landmarks
 _LAST = 10.0
+# in units of Ω: a landmark that is farther off once λ_C is in full lies on the other side of what
+# it would have to pass, such as a seam; more force only folds the map
+_LOST = 0.1
 
 
 class ConstrainedMap(AtTriangles):
@@ -33,7 +36,9 @@ class ConstrainedMap(AtTriangles):
     met whatever λ_C is; with ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the
     landmarks' targets move from where h has them at its start to their places
     (``constraints.ramp_of=targets``) or λ_C grows from a thousandth (``weights``), and the seam's
-    weight grows from zero: with the full terms at once, h would fold.
+    weight grows from zero: with the full terms at once, h would fold. Multipliers hold no landmark
+    that is still far off, and where the steps at triangles begin, such a one is let go: it is
+    missed, which figures tell, and the others are met without folds.
 
     Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
     ``landmark_error``.
@@ -59,6 +64,7 @@ class ConstrainedMap(AtTriangles):
     seam: Tensor
     boundary_samples: Tensor
     multipliers: Tensor
+    lost: Tensor
 
     def __init__(
         self,
@@ -96,6 +102,7 @@ class ConstrainedMap(AtTriangles):
         for name, tensor in given.items():
             self.register_buffer(name, tensor, persistent=False)
         self.register_buffer("multipliers", torch.zeros_like(targets))
+        self.register_buffer("lost", torch.zeros_like(there))  # let go
 
     @property
     def ramp(self) -> float:
@@ -111,6 +118,11 @@ class ConstrainedMap(AtTriangles):
             share *= _LAST
         return self.loss_weights.landmarks * share
 
+    @property
+    def held(self) -> Tensor:
+        """Mask (..., K) of the landmarks that the map should meet."""
+        return self.there & ~self.lost
+
     def landmark_terms(self) -> tuple[Tensor | float, Tensor | float]:
         """C = Σ ‖h(P) − Q_t‖² and the multipliers' Σ μ·(h(P) − Q_t), Q_t the target, which may
         move on the ramp, over the landmarks that there are; 0.0 where there are none."""
@@ -122,26 +134,26 @@ class ConstrainedMap(AtTriangles):
         if self.constraints.ramp_of == "targets":
             wanted = self.start + self.ramp * (self.targets - self.start)
         multipliers: Tensor | float = 0.0
-        C = (self.there * landmark(moved, wanted)).sum()
+        C = (self.held * landmark(moved, wanted)).sum()
         if self.constraints.landmarks == "augmented":
             multipliers = (self.multipliers * (moved - wanted)).sum()
         return C, multipliers
 
     def constraint_curvatures(
-        self, h: nn.Module, surface: nn.Module, there: Tensor, scale: float = 1.0
+        self, h: nn.Module, surface: nn.Module, held: Tensor, scale: float = 1.0
     ) -> list[Curvature]:
         """Those of the terms C and S of one map.
 
         Args:
             h: the map.
             surface: where it leads to.
-            there: (K,), which landmarks are.
+            held: (K,) mask of the landmarks that it should meet.
             scale: factor of both terms.
         """
         found = []
         if len(self.points):
             of_landmarks = 2 * scale * self.landmark_weight * torch.eye(2).to(self.points)
-            found.append(Curvature(h, self.points, there[:, None, None] * of_landmarks))
+            found.append(Curvature(h, self.points, held[:, None, None] * of_landmarks))
         if len(self.seam) and self.loss_weights.seam > 0:
             ends = self.seam.reshape(-1, 2)
             with torch.no_grad():
@@ -152,17 +164,25 @@ class ConstrainedMap(AtTriangles):
         return found
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        held = self.constraints
-        if held.landmarks != "augmented" or not len(self.points) or self.ramp < 1:
+        settings = self.constraints
+        if not len(self.points) or self.ramp < 1:
             return
-        if self.global_step < self.multipliers_from:
-            return
-        # at triangles a step is far longer, and nearer to the minimum
-        every = 1 if self.global_step > self.triangles_from else held.multiplier_every
-        if self.global_step % every == 0:
-            with torch.no_grad():
+        with torch.no_grad():
+            if self.global_step - 1 < self.triangles_from <= self.global_step:
+                self.lost |= ~self._near(self(self.points) - self.targets)
+                self.multipliers *= ~self.lost[..., None]
+            if settings.landmarks != "augmented" or self.global_step < self.multipliers_from:
+                return
+            # at triangles a step is far longer, and nearer to the minimum
+            every = 1 if self.global_step > self.triangles_from else settings.multiplier_every
+            if self.global_step % every == 0:
                 off = self(self.points) - self.targets
-                self.multipliers += 2 * self.weighed * off * self.there[..., None]
+                known = self.held & self._near(off)
+                self.multipliers += 2 * self.weighed * off * known[..., None]
+
+    def _near(self, off: Tensor) -> Tensor:
+        """Mask (..., K) of the landmarks that can be met, by what they are off (..., K, 2)."""
+        return off.norm(dim=-1) < _LOST
 
     def strengthen(self, steps: int) -> None:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of

@@ -170,7 +170,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         if self.caps is not None:
             step = self.global_step
             found.append(self.caps.curvature(self.map, self.psi, self.energy, w.injectivity, step))
-        found += self.constraint_curvatures(self.map, self.psi, self.there)
+        found += self.constraint_curvatures(self.map, self.psi, self.held)
         return found
 
     def _boundary_term(self, image: Tensor) -> Tensor:

@@ -46,7 +46,8 @@ MESH = (torch.as_tensor(_POINTS, dtype=torch.float32), torch.as_tensor(_FACES))
 def settings(changes):
     """The settings with changes: of the constraints, of the weights, or of the rest."""
     constraints = {key: changes.pop(key, value) for key, value in CONSTRAINTS.items()}
-    constraints |= {key: changes.pop(key) for key in ("pairs",) if key in changes}
+    more = ("pairs", "triangles_from")
+    constraints |= {key: changes.pop(key) for key in more if key in changes}
     weights = {**WEIGHTS, **changes.pop("weights", {})}
     return {**SETTINGS, "loss_weights": weights, "constraints": constraints, **changes}
 
@@ -183,6 +184,29 @@ def test_optimisation_lowers_distortion_and_meets_landmarks():
     assert (module(points) - targets).norm(dim=1).max() < 5e-3
     energy, determinant, _ = evaluated(module, samples(2000))
     assert energy.mean.item() < 4.5 and (determinant > 0).all()
+
+
+def test_a_landmark_that_stays_far_off_is_let_go_where_steps_at_triangles_begin(monkeypatch):
+    points = torch.tensor([[0.3, 0.0], [-0.4, 0.2]])
+    targets = points + torch.tensor([[0.02, 0.0], [0.5, 0.0]])  # h is the identity
+    changes = {"triangles_from": 0.5, "max_steps": 10}
+    module = pair(surface("plane"), surface("plane"), points, targets, **changes)
+    step = [4]
+    monkeypatch.setattr(PairMap, "global_step", property(lambda self: step[0]))
+    module.multipliers += 1.0
+    module.on_train_batch_end(None, None, 0)
+    assert module.held.tolist() == [True, True]
+    step[0] = 5
+    module.on_train_batch_end(None, None, 0)
+    assert module.held.tolist() == [True, False]
+    assert module.multipliers[1].tolist() == [0, 0]
+    before = module.multipliers[0].clone()
+    C, multipliers = module.landmark_terms()
+    off = (targets - points)[0]
+    assert C.item() == pytest.approx(float(off @ off), rel=1e-4)
+    assert multipliers.item() == pytest.approx(-float(before @ off), rel=1e-4)
+    error = module.landmark_error()  # still told
+    assert error[1] > 10 * error[0] > 0
 
 
 def test_multipliers_meet_landmarks_better_than_a_fixed_weight():
