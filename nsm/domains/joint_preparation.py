@@ -160,7 +160,7 @@ def prepare_jointly(
         how = (domain, parameterization, seam, seam_landmarks)
         one, parts = _cut_alike(meshes, cleaned, found, everywhere, *how, number)
     else:
-        four = None if cones is None else (np.cumsum(everywhere) - 1)[list(cones)]
+        four = None if cones is None else (np.cumsum(everywhere) - 1)[list(cones)].tolist()
         one, parts = _with_common_cones(meshes, cleaned, common_ids, domain, parameterization, four)
     surfaces = _laid_out(one, parts, processes)
     if cache:
