@@ -458,7 +458,7 @@ class CollectionConstraints(PairConstraints):
         boundary: exact: every h_i keeps to the domain by construction; penalty: λ_B pulls the image
             of the boundary to ∂Ω.
         landmarks: augmented: multipliers make landmarks exact; fixed: λ_C alone.
-        multiplier_every: steps between two updates of the multipliers.
+        multiplier_every: steps between two updates of the multipliers; at triangles, each step.
         ramp: share of the steps over which the weights of landmarks and seam rise to their values.
         fold_margin: what the determinant of J_h must stay above at the mesh triangles.
         fold_every: steps between two looks for the mesh triangles nearest to folding.
@@ -466,8 +466,10 @@ class CollectionConstraints(PairConstraints):
         ramp_of: what the ramp moves of the landmarks: targets, from where h_i has them at its
             start; or weights: λ_C grows from a thousandth.
         injectivity: what λ_inv weighs: exponential, of det J_h at samples that fold; or smooth, of
-            det J_h where a step takes it below a third, for quasi-Newton steps.
-        triangles_from: of task=pair_map alone.
+            det J_h where a step takes it below a third, for quasi-Newton steps. At triangles it is
+            smooth.
+        triangles_from: share of the steps after which quasi-Newton steps measure distortion at
+            triangles of all surfaces' meshes, and move one h_i after the other.
         pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
             mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.
     """

@@ -51,6 +51,8 @@ TASKS = {
     ("published", "param"): "param",
     ("published", "pair_map"): "pair_map",
     ("constraints", "pair_newton"): "pair_map",
+    ("constraints", "collection_newton"): "collection_map",
+    ("loss_weights", "collection_newton"): "collection_map",
     ("loss_weights", "pair_newton"): "pair_map",
     ("optimizer", "adam_newton"): "pair_map",
     ("experiment", "adam"): "pair_map",
@@ -216,7 +218,7 @@ def test_a_sweep_of_energies_is_for_every_map(task):
     [
         "task=overfit",
         "task=param experiment=adam",
-        "task=collection_map",
+        "task=collection_map experiment=adam",
         "task=pair_map experiment=adam",
     ],
 )

@@ -100,7 +100,9 @@ class CollectionMap(ConstrainedMap):
         self.triangles_from = held.triangles_from * max_steps
         if held.triangles_from < 1:
             project = domain.project if domain.has_boundary and self.exact else None
-            self.quadrature = CollectionQuadrature(meshes, list(self.phis), project)
+            self.quadrature = CollectionQuadrature(
+                meshes, list(self.phis), domain, points, targets, project
+            )
         self._turn: Turn | None = None
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")

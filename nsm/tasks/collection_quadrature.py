@@ -13,7 +13,8 @@ from nsm.energies import At, first_fundamental_form
 from nsm.maps.inverse import preimages
 from nsm.tasks.mesh_quadrature import MOST, MeshQuadrature, Triangles, triangles
 
-_FOUND = 1e-6
+_FOUND = 1e-6  # in Ω
+_SAME = 1e-5  # on a surface
 
 
 class Turn(NamedTuple):
@@ -57,19 +58,30 @@ class CollectionQuadrature(nn.Module):
     Args:
         meshes: uv (V, 2), in each surface's own domain, and faces (F, 3).
         surfaces: φ_j.
+        domain: Ω.
+        landmarks: (K, 2) in the common domain.
+        targets: (k, K, 2) the same in each surface's own; NaN where it lacks the landmark.
         project: from points to the nearest ones of the common domain, if maps keep to it.
     """
+
+    landmarks: Tensor
+    targets: Tensor
 
     def __init__(
         self,
         meshes: Sequence[tuple[Tensor, Tensor]],
         surfaces: Sequence[nn.Module],
+        domain: Any,
+        landmarks: Tensor,
+        targets: Tensor,
         project: Any = None,
     ) -> None:
         super().__init__()
         both = zip(meshes, surfaces, strict=True)
         self.each = nn.ModuleList(MeshQuadrature(*mesh, phi) for mesh, phi in both)
-        self.project = project
+        self.domain, self.project = domain, project
+        self.register_buffer("landmarks", landmarks, persistent=False)
+        self.register_buffer("targets", targets, persistent=False)
 
     @torch.no_grad()
     def turn(self, number: int, maps: Sequence[nn.Module]) -> Turn:
@@ -83,7 +95,7 @@ class CollectionQuadrature(nn.Module):
         few = sum(len(one.faces) for one in each) <= MOST
         most = MOST if few else MOST // len(each)
         parts = [one.take(most, most) for one in each]
-        corners = [self._taken_back(h, part.uv) for h, part in zip(maps, parts, strict=True)]
+        corners = [self._taken_back(h, parts[j], j) for j, h in enumerate(maps)]
         ends = torch.tensor([0, *(len(part.uv) for part in parts)]).cumsum(0).tolist()
         faces = torch.cat([part.faces + n for part, n in zip(parts, ends[:-1], strict=True)])
         some = triangles(torch.cat(corners), faces, torch.cat([part.points for part in parts]))
@@ -106,9 +118,20 @@ class CollectionQuadrature(nn.Module):
         at = At(centres[of], on_surfaces[of])
         return Turn(number, some, of, owner[of] == number, torch.cat(held), at)
 
-    def _taken_back(self, h: Any, uv: Tensor) -> Tensor:
-        """h⁻¹ (V, 2), NaN where none is found."""
-        exact, targets = copy.deepcopy(h).cpu().double(), uv.cpu().double()
-        x = preimages(exact, targets, exact.back(targets), self.project)
-        off = (exact(x) - targets).norm(dim=1, keepdim=True)
-        return torch.where(off < _FOUND, x, torch.nan).to(uv)
+    def _taken_back(self, h: Any, part: Triangles, number: int) -> Tensor:
+        """h⁻¹ (V, 2) of corners, NaN where none is found; landmarks lie at their places.
+
+        Where h misses a landmark, what brings it there must not fold unseen between the corners.
+        """
+        exact, uv = copy.deepcopy(h).cpu().double(), part.uv.cpu().double()
+        x = preimages(exact, uv, exact.back(uv), self.project)
+        off = (exact(x) - uv).norm(dim=1, keepdim=True)
+        x = torch.where(off < _FOUND, x, torch.nan).to(part.uv)
+        each: Any = self.each[number]
+        targets = self.targets[number]
+        marks = each.surface(targets.nan_to_num())
+        marks = torch.where(targets.isfinite().all(dim=1, keepdim=True), marks, torch.inf)
+        mode = "donot_use_mm_for_euclid_dist"
+        vertex, mark = (torch.cdist(part.points, marks, compute_mode=mode) < _SAME).nonzero().T
+        x[vertex] = self.domain.lift(self.landmarks[mark], x[vertex])
+        return x

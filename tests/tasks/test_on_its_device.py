@@ -55,7 +55,7 @@ def inputs(task, phis):
         ("pair_map", ["map.cells=8"]),
         ("pair_map", ["experiment=adam", *SMALL]),
         # the watch on triangles looks for those that are nearest to folding, by numbers
-        ("collection_map", [*SMALL, "loss_weights.triangles=0"]),
+        ("collection_map", ["experiment=adam", *SMALL, "loss_weights.triangles=0"]),
     ],
 )
 def test_a_step_keeps_to_the_device_of_its_network(task, words, phis):

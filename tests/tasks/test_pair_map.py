@@ -338,6 +338,76 @@ def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
     assert back.item() == pytest.approx(back_weighted.item(), rel=0.05)
 
 
+def turned(names, number, **changes):
+    """A collection at the triangles of its meshes, where the map of one surface has its turn."""
+    module = collection(names, triangles_from=0.0, **changes)
+    module._turn = module.quadrature.turn(number, list(module.map))
+    return module
+
+
+def test_at_triangles_maps_take_turns():
+    module = collection(["plane", "saddle", "sphere_cap"], triangles_from=0.0)
+    found = [(h, module._turn.number) for h in module.turns()]
+    assert found == [(h, i) for i, h in enumerate(module.map)] and module._turn is None
+    at_samples = collection(["plane"] * 3)
+    assert list(at_samples.turns()) == [at_samples.map]
+
+
+def test_in_its_turn_a_map_has_the_energy_of_its_pairs_at_the_sources_triangles():
+    names = ["plane", "saddle", "sphere_cap"]
+    module = turned(names, 1)
+    own = module._evaluated(samples())[0].mean.item()
+    both = [(0, 1), (2, 1), (1, 0), (1, 2)]
+    found = []
+    for ends in both:
+        f = pair(
+            *(surface(names[n]) for n in ends), constraints={**CONSTRAINTS, "triangles_from": 0.0}
+        )
+        found.append(f._evaluated(Batch(samples()))[0].mean.item())
+    assert own == pytest.approx(sum(found) / 4, rel=1e-4)
+
+
+def test_moved_triangles_are_those_that_the_map_makes_of_the_meshes():
+    """Taken back by each h_i as it is, the corners lead to the meshes' own vertices."""
+    module = collection(["plane", "saddle", "sphere_cap"], triangles_from=0.0)
+    torch.manual_seed(1)
+    with torch.no_grad():
+        for p in module.map.parameters():
+            p += 0.02 * torch.randn_like(p)
+    for number, h in enumerate(module.map):
+        turn = module.quadrature.turn(number, list(module.map))
+        own = turn.of[turn.outward].unique()
+        corners = turn.some.uv[turn.some.faces[own]]
+        torch.testing.assert_close(h(corners), MESH[0][MESH[1]], atol=1e-5, rtol=0)
+    assert float((module(MESH[0])[0] - MESH[0]).detach().abs().max()) > 1e-3
+
+
+def test_a_turn_s_loss_has_the_gradient_of_the_whole_loss():
+    """k/2 times the part of L at the same triangles: by finite differences of the pairs."""
+    module = turned(["plane", "saddle", "sphere_cap"], 2)
+    module.training_step(samples(), 0).backward()
+    p = next(p for p in module.map[2].parameters() if p.grad is not None and p.grad.abs().max() > 0)
+    place = int(p.grad.abs().argmax())
+    ends = []
+    for change in (1e-2, -2e-2):
+        with torch.no_grad():
+            p.view(-1)[place] += change
+        ends.append(module._evaluated(samples())[0].mean.item())
+    assert (ends[0] - ends[1]) / 2e-2 == pytest.approx(p.grad.view(-1)[place].item(), rel=0.05)
+    others = [q.grad for h in module.map[:2] for q in h.parameters()]
+    assert all(g is None or float(g.abs().max()) == 0 for g in others)
+
+
+def test_a_landmark_that_a_map_misses_is_a_corner_of_the_triangles():
+    points, number = MESH[0][5:6] + 0.01, 1
+    targets = MESH[0][5:6].expand(3, 1, 2).clone()
+    targets[2] = torch.nan
+    module = turned(["plane", "saddle", "sphere_cap"], number, points=points, targets=targets)
+    uv = module._turn.some.uv
+    assert ((uv - points).norm(dim=1) < 1e-6).sum() == 2  # of the two surfaces that have it
+    assert ((uv - MESH[0][5]).norm(dim=1) < 1e-6).sum() == 1
+
+
 def test_the_paper_sums_over_all_ordered_pairs():
     names, x = ["plane", "saddle", "sphere_cap"], samples(512)
     points, targets = torch.tensor([[0.2, 0.1]]), torch.tensor([[[0.3, 0.1]]] * 3)

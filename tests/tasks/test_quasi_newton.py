@@ -264,3 +264,32 @@ def test_a_further_training_is_on_the_finest_level():
         f.coefficients.fill_(0.1)
     optimizer = build_optimizer(f, SETTINGS)
     assert optimizer.state[f.coefficients]["step"] == sum(SETTINGS["steps"])
+
+
+def test_parts_take_turns_while_the_rest_is_held():
+    maps = torch.nn.ModuleList(PlanarMap(SplineField(2, 8)) for _ in range(2))
+    fields = [h.network for h in maps]
+    optimizer = QuasiNewton(
+        [f.coefficients for f in fields], fields, [8], [], iterations=3, smoothing=0.0
+    )
+    x, seen = points(400).float(), []
+
+    def turns():
+        for n, h in enumerate(maps):
+            seen.append([f.coefficients.detach().clone() for f in fields])
+            optimizer.number = n
+            yield h
+
+    def closure():
+        optimizer.zero_grad()
+        wanted = x + 0.1 * torch.sin(3 * x.flip(1))
+        loss = sum(((h(x) - wanted) ** 2).sum(dim=1).mean() for h in maps)
+        loss.backward()
+        return loss.detach()
+
+    identity = torch.eye(2).expand(400, 2, 2) * (2 / 400)
+    optimizer.watch(lambda: [Curvature(maps[optimizer.number], x, identity)], turns)
+    optimizer.step(closure)
+    (first, held), (moved, still) = seen
+    assert not held.any() and not still.any() and moved.any() and not first.any()
+    torch.testing.assert_close(fields[1].coefficients, fields[0].coefficients)
