@@ -202,6 +202,7 @@ def test_a_map_without_landmarks_is_a_homeomorphism(shapes):
     )
     assert f.certificate["certified"] and f.metrics["symmetric_dirichlet_median"] < 6
     assert "landmark_error_max_percent" not in f.metrics
+    assert f.metrics["landmarks_sure"] is False  # nothing but its distortion has chosen it
 
 
 @pytest.mark.parametrize("domain", ["orbifold", "torus"])

@@ -303,6 +303,7 @@ def test_analytic_targets_and_no_landmarks(here, domain):
     folder = run.stdout.strip().splitlines()[-1].removeprefix("results in ")
     f = nsm.load(folder)
     assert f.target.surface.name == "graph"
+    assert "landmarks_sure" not in f.metrics  # there is nothing to correspond
     assert f.metrics["flipped_percent"] == 0 and f.metrics["outside_percent"] == 0
 
 

@@ -22,7 +22,9 @@ Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def choose_common_cones(
-    meshes: Sequence[Mesh], landmarks: Sequence[np.ndarray], four: Sequence[int] | None = None
+    meshes: Sequence[Mesh],
+    landmarks: Sequence[np.ndarray],
+    four: Sequence[int] | np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
     """Four landmarks that, as cones of all surfaces, make domains of little distortion.
 
