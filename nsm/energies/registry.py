@@ -33,9 +33,13 @@ Energy = Callable[..., Tensor]
 
 @dataclass(frozen=True)
 class _OfMetrics:
-    """An energy of this room as an object; its fields are the parameters of ``formula``."""
+    """An energy of this room as an object; its fields are the parameters of ``formula``.
+
+    ``scale_free``: whether the map and its multiples have one energy.
+    """
 
     formula: ClassVar[Callable[..., Tensor]]
+    scale_free: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         isometry = torch.eye(2)
@@ -65,6 +69,7 @@ class Conformal(_OfMetrics):
     """METHOD, Eq. 3 (see :func:`nsm.energies.conformal`)."""
 
     formula = staticmethod(distortion.conformal)
+    scale_free = True
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,7 @@ class SingularValueRatio(_OfMetrics):
     """σ₁/σ₂ (see :func:`nsm.energies.singular_value_ratio`)."""
 
     formula = staticmethod(distortion.singular_value_ratio)
+    scale_free = True
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,7 @@ class MIPS(_OfMetrics):
     """σ₁/σ₂ + σ₂/σ₁ (see :func:`nsm.energies.mips`)."""
 
     formula = staticmethod(distortion.mips)
+    scale_free = True
 
 
 @dataclass(frozen=True)

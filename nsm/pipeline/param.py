@@ -30,6 +30,7 @@ from nsm.results import (
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
+from nsm.results.parameterization import in_file_units
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.patterns import write_patterns
 from nsm.stages import at
@@ -160,7 +161,7 @@ class ParamTask(Task):
         for ending in (".obj", ".glb"):
             export_surface(folder / f"parameterized{ending}", vertices, surface, inside)
         faces = surface.faces[~surface.filled]
-        write_patterns(folder / "pattern", result.uv / surface.scale, faces)
+        write_patterns(folder / "pattern", in_file_units(result), faces)
         energy = str(self.config.energy["_target_"]).rpartition(".")[2]
         name, before = list(self._before.items())[-1]
         what = {"domain": "domain Ω", "given": "given UV"}[name]

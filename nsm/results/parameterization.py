@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torch import nn
 
+import nsm.energies
 from nsm.domains import Domain
+from nsm.domains.planar_mesh import signed_areas
 from nsm.maps import Placed, PlanarMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired
@@ -22,6 +24,7 @@ from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
 from nsm.results.points import as_points
 from nsm.surfaces.location import locate
+from nsm.surfaces.topology import face_areas
 
 FORMAT = "nsm-parameterization"
 STEM = "map"
@@ -115,3 +118,18 @@ def load_parameterization(folder: str | Path, trust: Iterable[str] = ()) -> Para
     except DAMAGE as error:
         raise damaged(stem, error) from error
     return Parameterization(phi, h, metrics, config, correction)
+
+
+def in_file_units(flat: Parameterization) -> np.ndarray:
+    """The new coordinates (V, 2) in the units of the mesh file.
+
+    An energy that does not see the scale leaves it to chance: the surface's area is kept then.
+    """
+    surface = flat.phi.surface
+    target = str(flat.config.get("energy", {}).get("_target_", ""))
+    known = getattr(nsm.energies, target.rpartition(".")[2], None)
+    factor = 1.0
+    if target.startswith("nsm.energies.") and getattr(known, "scale_free", False):
+        area = face_areas(surface.vertices, surface.faces).sum()
+        factor = float(np.sqrt(area / np.abs(signed_areas(flat.uv, surface.faces)).sum()))
+    return flat.uv * factor / surface.scale

@@ -15,7 +15,7 @@ from nsm.errors import NsmError
 from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
 from nsm.results.meshes import export_mesh
-from nsm.results.parameterization import Parameterization, load_parameterization
+from nsm.results.parameterization import Parameterization, in_file_units, load_parameterization
 from nsm.results.patterns import write_patterns
 from nsm.results.textures import checkerboard
 from nsm.surfaces.atlas import packed
@@ -45,7 +45,7 @@ class ParameterizationAtlas:
 
     @cached_property
     def _packed(self) -> tuple[list[np.ndarray], float]:
-        flat = [(c.uv / c.phi.surface.scale, c.phi.surface.faces) for c in self.charts]
+        flat = [(in_file_units(c), c.phi.surface.faces) for c in self.charts]
         return packed(flat)
 
     @property

@@ -20,6 +20,15 @@ def test_objects_are_their_functions(name):
     assert torch.equal(made_again(A, B, AT), getattr(distortion, name)(A, B))
 
 
+@pytest.mark.parametrize("name", ENERGIES)
+def test_energies_without_scale_are_those_that_say_so(name):
+    energy = ENERGIES[name]()
+    source = torch.eye(2, dtype=torch.float64)
+    target = torch.tensor([[3.0, 0.4], [0.4, 1.2]], dtype=torch.float64)
+    same = bool(torch.isclose(energy(source, target), energy(source, 4 * target)))
+    assert same == energy.scale_free
+
+
 def test_parameters_are_passed_on():
     want = distortion.symmetric_dirichlet(A, B, epsilon=0.5)
     assert torch.equal(SymmetricDirichlet(epsilon=0.5)(A, B), want)

@@ -1,6 +1,7 @@
 """task=param along given seams: one chart, or an atlas of several."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -12,6 +13,7 @@ from tiny import FLATTENING, TRAINING
 
 import nsm
 from nsm.errors import NsmError
+from nsm.results.parameterization import in_file_units
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.results.textured_mesh import TexturedMesh
 from nsm.results.view import serving
@@ -88,6 +90,21 @@ def test_the_pattern_shows_every_chart_in_units_of_the_file(run):
         length = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).sum()
         wanted.append(length / chart.phi.surface.scale)
     assert sorted(drawn) == pytest.approx(sorted(wanted), rel=1e-5)
+
+
+def test_a_pattern_has_the_area_of_the_surface_where_the_energy_does_not_see_it(run):
+    chart = run[1].charts[0]
+    surface = chart.phi.surface
+    vertices = chart.phi.in_original_units(surface.vertices)
+    wanted = topology.face_areas(vertices, surface.faces).sum()
+
+    def area(energy):
+        flat = in_file_units(replace(chart, config={"energy": {"_target_": energy}}))
+        return topology.face_areas(np.pad(flat, ((0, 0), (0, 1))), surface.faces).sum()
+
+    kept = area("nsm.energies.SymmetricDirichlet")
+    assert kept == pytest.approx(area("mine.Conformal")) != pytest.approx(wanted, rel=1e-4)
+    assert area("nsm.energies.Conformal") == pytest.approx(wanted, rel=1e-6)
 
 
 def test_given_edges_cut_one_chart():
