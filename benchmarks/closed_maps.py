@@ -51,7 +51,7 @@ WAYS: dict[str, list[str]] = {
     "fast": ["experiment=fast"],
     "adam": ["experiment=adam"],
 }
-OF_COLLECTION = ("default", "fast")  # a collection's default is Adam
+OF_COLLECTION = ("default", "adam")
 START = ["trainer.max_steps=1", "artefacts=false", "certification.repair=false"]  # fills the cache
 
 

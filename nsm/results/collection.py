@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
 from nsm.maps import PlanarMap, TransitionMap
+from nsm.maps.inverse import preimages
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, combined
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
@@ -54,6 +55,7 @@ class SurfaceCollection:
     corrections: dict[tuple[int, int], Correction] = field(default_factory=dict, repr=False)
     _made: dict[tuple[int, int], SurfaceMap] = field(default_factory=dict, repr=False)
     _back: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
+    _marked: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.surfaces)
@@ -118,15 +120,9 @@ class SurfaceCollection:
         return itertools.permutations(range(len(self)), 2)
 
     def _pair(self, source: int, target: int) -> SurfaceMap:
-        # h_i is near the affine map that it starts from, so the surface's vertices, taken back,
-        # lie densely in the common domain
-        first, s = _double(self.maps[source]), self.surfaces[source].surface
-        nodes: Tensor = first.back(torch.as_tensor(s.uv))  # type: ignore[operator]
-        domain = s.domain
-        project = None
-        if isinstance(domain, BoundedDomain) and not isinstance(first.inner, PlanarMap):
-            project = domain.project
-        h = TransitionMap(first, _double(self.maps[target]), nodes, project).eval()
+        first, second = (_double(self.maps[n]) for n in (source, target))
+        s = self.surfaces[source].surface
+        h = TransitionMap(first, second, self._nodes(source), self._project).eval()
         if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
             uv = torch.as_tensor(s.uv)
             self._back[source] = torch.cat([h.back(part) for part in uv.split(_CHUNK)]).numpy()
@@ -138,8 +134,44 @@ class SurfaceCollection:
             {},
             self.config,
             self.corrections.get((source, target), Correction()),
-            domain.copied(s.uv, s.seam_pairs, evaluate(h.second, self._back[source])),
+            s.domain.copied(s.uv, s.seam_pairs, evaluate(h.second, self._back[source])),
         )
+
+    @property
+    def _project(self) -> Callable[[Tensor], Tensor] | None:
+        """To the nearest points of the common domain, if maps keep to it."""
+        domain, h = self.surfaces[0].surface.domain, self.maps[0]
+        exact = isinstance(domain, BoundedDomain) and not isinstance(h.inner, PlanarMap)
+        return domain.project if exact else None  # type: ignore[attr-defined]
+
+    def _nodes(self, source: int) -> Tensor:
+        """(M, 2) points of the common domain that Newton's method starts from.
+
+        Those of the source's vertices: h_i is near the affine map that it starts from, so the
+        surface's vertices, taken back, lie densely there. And where other maps have the landmarks:
+        where h_i folds beside a landmark, several points lead there, and the common one is wanted.
+        """
+        s = self.surfaces[source].surface
+        near: Tensor = _double(self.maps[source]).back(torch.as_tensor(s.uv))  # type: ignore[operator]
+        ids = self.landmarks[:, source]
+        mine = np.flatnonzero(ids >= 0)
+        row, number = np.nonzero(s.source_vertex[:, None] == s.kept(ids[mine].tolist()))
+        others = [self._places(n)[mine[number]] for n in range(len(self)) if n != source]
+        common = [x.isfinite().all(dim=1) for x in others]
+        both = zip(others, common, strict=True)
+        return torch.cat([near, *(s.domain.lift(x[there], near[row][there]) for x, there in both)])
+
+    def _places(self, number: int) -> Tensor:
+        """Where a surface's map has the landmarks in the common domain, (L, 2); NaN: nowhere."""
+        if number not in self._marked:
+            s, h = self.surfaces[number].surface, _double(self.maps[number])
+            uv, ids = torch.as_tensor(s.uv), self.landmarks[:, number]
+            targets = uv[s.cut_vertex[ids[ids >= 0]]]
+            found = preimages(h, targets, h.back(uv), self._project)  # type: ignore[operator]
+            places = found.new_full((len(ids), 2), torch.nan)
+            places[torch.as_tensor(ids >= 0)] = found
+            self._marked[number] = places
+        return self._marked[number]
 
     def save(self, folder: str | Path) -> None:
         """Write the maps into a folder, and each surface into ``surface_0``, ... there.

@@ -158,3 +158,39 @@ def test_a_fast_run_has_a_validation_curve_of_several_points(task):
     config = compose_config([f"task={task}", "experiment=fast"])
     assert config.trainer.max_steps >= 2 * config.data.steps_per_epoch
     assert config.trainer.log_every == 1
+
+
+def collection_of(surfaces, folder, **extra):
+    """The default training of three surfaces, in few steps; the third lacks the last landmark."""
+    settings = [
+        "task=collection_map",
+        *(w for w in WORDS if w.startswith(("domain=", "trainer.prog", "artef", "logger"))),
+        *("map.cells=8", "data.batch_size=256", "data.steps_per_epoch=2", "data.held_out=256"),
+        *("trainer.tabulated=64", "trainer.max_steps=6", "constraints.triangles_from=0.5"),
+        *("optimizer.iterations=6", "certification.rounds=0"),
+    ]
+    first, second = (list(each) for each in zip(*MARKS, strict=True))
+    given = Given(surfaces=[*surfaces, surfaces[0]], landmarks=[first, second, [*first[:-1], -1]])
+    return run_task(compose_config(settings), folder, given, **extra)
+
+
+def test_a_collection_meets_its_landmarks_and_resumes_between_turns(
+    surfaces, tmp_path, monkeypatch
+):
+    whole = collection_of(surfaces, tmp_path / "whole")
+    assert whole.certificate["certified"]
+    assert max(values_of(whole.metrics, "landmark_error_max_percent")) < 0.1
+    written = callbacks.AtomicCheckpoint.on_train_epoch_end
+
+    def stop(self, trainer, module):
+        written(self, trainer, module)
+        if trainer.global_step == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
+    with pytest.raises(KeyboardInterrupt):
+        collection_of(surfaces, tmp_path / "parted")
+    monkeypatch.undo()
+    resumed = collection_of(surfaces, tmp_path / "parted", resuming=True)
+    for h, again in zip(whole.maps, resumed.maps, strict=True):
+        assert all(torch.equal(w, again.state_dict()[key]) for key, w in h.state_dict().items())
