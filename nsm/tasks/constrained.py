@@ -184,6 +184,10 @@ class ConstrainedMap(AtTriangles):
         """Mask (..., K) of the landmarks that can be met, by what they are off (..., K, 2)."""
         return off.norm(dim=-1) < _LOST
 
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        checkpoint["state_dict"].setdefault("lost", self.lost)  # an earlier version's lets none go
+
     def strengthen(self, steps: int) -> None:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of
         folding triangles is ten times as large and acts on more of them, in small steps."""

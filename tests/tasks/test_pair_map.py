@@ -207,6 +207,9 @@ def test_a_landmark_that_stays_far_off_is_let_go_where_steps_at_triangles_begin(
     assert multipliers.item() == pytest.approx(-float(before @ off), rel=1e-4)
     error = module.landmark_error()  # still told
     assert error[1] > 10 * error[0] > 0
+    earlier = {"microbatches": 1, "state_dict": {}}  # of a version that let none go
+    module.on_load_checkpoint(earlier)
+    assert earlier["state_dict"]["lost"].shape == (2,)
 
 
 def test_multipliers_meet_landmarks_better_than_a_fixed_weight():
