@@ -112,6 +112,7 @@ def test_real_clicks(edited, window):
     def click(side, vertex, expected):
         mouse(window, [pixel(editor, window, editor.placed[side][vertex])])
         until(lambda: [m.vertices for m in editor.landmarks.landmarks] == expected)
+        time.sleep(2)  # markers and handles are drawn: a click before that is theirs
 
     ends = [editor.placed[k][point(k, [x, 0, 0])] for k, x in ((0, -1), (1, 1))]
     left, right = (pixel(editor, window, end)[0] for end in ends)
