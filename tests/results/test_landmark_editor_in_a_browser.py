@@ -112,6 +112,11 @@ def test_real_clicks(edited, window):
     def click(side, vertex, expected):
         mouse(window, [pixel(editor, window, editor.placed[side][vertex])])
         until(lambda: [m.vertices for m in editor.landmarks.landmarks] == expected)
+        time.sleep(2)  # markers and handles are drawn: a click before that is theirs
+
+    ends = [editor.placed[k][point(k, [x, 0, 0])] for k, x in ((0, -1), (1, 1))]
+    left, right = (pixel(editor, window, end)[0] for end in ends)
+    assert right - left > 0.4 * SIZE["width"]  # the shapes fill what the panel leaves
 
     first, second = point(0, [-0.5, 0.3, 1]), point(1, [0.3, -0.4, 1])
     click(0, first, [(first, None)])

@@ -18,6 +18,7 @@ from nsm.results.files import atomic_write
 from nsm.results.meshes import by_position
 from nsm.results.view.colours import distinct_colours
 from nsm.results.view.picking import hit
+from nsm.results.view.scene import FIELD_OF_VIEW, beside_the_panel
 
 _GAP = 1.3  # between the middles of shapes, in diameters
 _RADIUS = 0.02  # of a marker; every shape has the diameter one
@@ -70,9 +71,13 @@ class LandmarkEditor:
         self.handles: list[Any] = []  # by which the selected landmark is dragged
         self._lock = threading.RLock()  # viser runs callbacks in several threads
         server.scene.set_up_direction("+y")
-        middle, far = 0.5 * _GAP * (len(shapes) - 1), _GAP * len(shapes)
-        server.initial_camera.position = (middle, 0.0, far)
-        server.initial_camera.look_at = (middle, 0.0, 0.0)
+        corners = np.concatenate(self.placed)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        aside, distance = beside_the_panel(*(0.5 * (high - low)))
+        aim = 0.5 * (low + high) + [aside, 0.0, 0.0]
+        server.initial_camera.fov = FIELD_OF_VIEW
+        server.initial_camera.position = tuple(aim + [0.0, 0.0, distance])
+        server.initial_camera.look_at = tuple(aim)
         self._build_panel()
         self.paint(None)
         server.scene.on_click()(self.on_click)

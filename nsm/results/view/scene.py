@@ -32,8 +32,15 @@ _FIXED = {"symmetric dirichlet": (4.0, 20.0)}  # one scale for all maps; others 
 _LARGEST = 1e3
 _NO_VERTICES = np.zeros(0, dtype=np.int64)
 _ONE_SQUARE = np.array([1 / 32, 1 / 32])  # the middle of a square of the checkerboard
-_FIELD_OF_VIEW = np.radians(18)  # narrow: both shapes are seen from the same direction
+FIELD_OF_VIEW = float(np.radians(18))  # narrow: both shapes are seen from the same direction
 _ASPECT, _ASIDE = 1.5, 0.26  # of a browser window, with the panel at its right
+
+
+def beside_the_panel(width: float, height: float, depth: float) -> tuple[float, float]:
+    """How far to the right of the middle a camera of :data:`FIELD_OF_VIEW` looks, and from how far
+    away, to see a box of half this width, height and depth beside the panel."""
+    tangent = float(np.tan(0.5 * FIELD_OF_VIEW))
+    return _ASIDE * width, 1.1 * max(width / (_ASPECT * tangent), height / tangent) + depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,12 +236,11 @@ class Scene:
         """Position and target (3,) of a camera that sees both shapes (:attr:`field_of_view`)."""
         width = self._half[:, 0].sum() + _GAP * self._half[:, 0].max()
         height, depth = self._half[:, 1:].max(axis=0)
-        tangent = np.tan(0.5 * self.field_of_view)
-        distance = 1.1 * max(width / (_ASPECT * tangent), height / tangent) + depth
-        aim = _ASIDE * width * self.frame[0]
+        aside, distance = beside_the_panel(width, height, depth)
+        aim = aside * self.frame[0]
         return aim + distance * self.frame[2], aim
 
-    field_of_view = float(_FIELD_OF_VIEW)
+    field_of_view = FIELD_OF_VIEW
 
 
 Shown = NeuralSurface | Parameterization | ParameterizationAtlas | SurfaceMap
