@@ -158,8 +158,37 @@ def write(lines: list[dict[str, Any]]) -> None:
     for line in sorted(lines, key=lambda one: order[one["class"], one["row"]]):
         cells = [line["class"], line["row"], *(shown(line, key) for key in COLUMNS)]
         rows.append(f"| {' | '.join(cells)} |")
-    RESULT.with_suffix(".md").write_text("\n".join(rows) + "\n")
+    RESULT.with_suffix(".md").write_text("\n".join([*rows, "", *by_class(lines)]) + "\n")
     print(json.dumps(summary))
+
+
+def by_class(lines: list[dict[str, Any]]) -> list[str]:
+    """The table of docs/maps.md: each class with many landmarks, and with none."""
+    heads = [
+        *("class", "landmarks", "median as h starts", "median", "95th percentile"),
+        *("flipped % before repair", "landmarks missed, %", "certified", "error"),
+        *("error, none given", "told as unsure", "seconds, given and none"),
+    ]
+    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    of = {(line["class"], line["row"]): line for line in lines}
+    digits = {
+        "start_symmetric_dirichlet_median": 2,
+        "symmetric_dirichlet_median": 2,
+        "symmetric_dirichlet_p95": 1,
+        "flipped_before_repair_percent": 2,
+        "landmark_error_max_percent": 3,
+    }
+    for name in NAMES:
+        given, none = of.get((name, "given")), of.get((name, "none"), {})
+        if given is None:
+            continue
+        figures = [f"{given[key]:.{places}f}" for key, places in digits.items()]
+        alone = [shown(none, key) for key in ("error", "told")]
+        seconds = f"{shown(given, 'seconds')}, {shown(none, 'seconds')}"
+        certified, error = shown(given, "certified"), shown(given, "error")
+        cells = [name, str(given["given"]), *figures, certified, error, *alone, seconds]
+        rows.append(f"| {' | '.join(cells)} |")
+    return rows
 
 
 def main() -> None:

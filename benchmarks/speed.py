@@ -478,7 +478,7 @@ def page(results: dict[str, Any]) -> str:
             "",
             "Loss and gradient, compared with a plain restatement of the published recipe (one "
             "`autograd.grad` per output, batched SVD and explicit inverse) for the same networks "
-            f"and batch. The collection has {SURFACES} surfaces. Flattening and pair maps take "
+            f"and batch. The collection has {SURFACES} surfaces. Maps take "
             "quasi-Newton steps on a spline by default, which the recipe has no counterpart of: "
             "the network of `experiment=adam` takes their place.",
             "",
@@ -600,7 +600,7 @@ def write_page() -> None:
 
 
 # tasks whose default trains a spline, by steps that the recipe has no counterpart of
-_SPLINES = ("param", "pair_map")
+_SPLINES = ("param", "pair_map", "collection_map")
 PARTS = ("costs", "peak", "growth", "batches", "memory", "times")
 
 

@@ -168,7 +168,7 @@ def rows(text):
 @pytest.mark.parametrize(
     ("page", "heading", "files"),
     [
-        ("maps", "## Measurements", ["maps.md", "closed_maps.md"]),
+        ("maps", "## Measurements", ["maps.md", "closed_maps.md", "classes.md"]),
         (
             "optimization",
             "## Error over time",

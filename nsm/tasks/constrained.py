@@ -20,8 +20,8 @@ _ON_BOUNDARY = 1e-6
 _FIRST = 1e-3
 # factor of λ_C at triangles, where few steps are left to meet the landmarks
 _LAST = 10.0
-# in units of Ω: a landmark that is farther off once λ_C is in full lies on the other side of what
-# it would have to pass, such as a seam; more force only folds the map
+# in units of Ω: where there is a seam, a landmark that is farther off once λ_C is in full lies on
+# the other side of it; more force only folds the map
 _LOST = 0.1
 
 
@@ -36,9 +36,9 @@ class ConstrainedMap(AtTriangles):
     met whatever λ_C is; with ``fixed``, λ_C acts alone. During the ramp, a share of the steps, the
     landmarks' targets move from where h has them at its start to their places
     (``constraints.ramp_of=targets``) or λ_C grows from a thousandth (``weights``), and the seam's
-    weight grows from zero: with the full terms at once, h would fold. Multipliers hold no landmark
-    that is still far off, and where the steps at triangles begin, such a one is let go: it is
-    missed, which figures tell, and the others are met without folds.
+    weight grows from zero: with the full terms at once, h would fold. Where there is a seam,
+    multipliers hold no landmark that is still far off, and where the steps at triangles begin, such
+    a one is let go: it is missed, which figures tell, and the others are met without folds.
 
     Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
     ``landmark_error``.
@@ -182,7 +182,7 @@ class ConstrainedMap(AtTriangles):
 
     def _near(self, off: Tensor) -> Tensor:
         """Mask (..., K) of the landmarks that can be met, by what they are off (..., K, 2)."""
-        return off.norm(dim=-1) < _LOST
+        return off.norm(dim=-1) < (_LOST if len(self.seam) else torch.inf)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)

@@ -211,7 +211,7 @@ def test_collections_are_certified_and_their_cycles_close(shapes, tmp_path, doma
     third = trimesh.load(files[0], process=False)
     path = _exported(tmp_path, "third", third.vertices[:, [1, 2, 0]] * [1, 1.2, 1], third.faces)
     overrides = [f"domain={domain}", *QUICK, MADE, "trainer.max_steps=60"]
-    overrides.append("encoding.resolutions=[8,16]")
+    overrides.append("map.cells=16")
     folder = tmp_path / "run"
     g = nsm.map_collection(
         [*files, path], [marks] * 3, overrides=overrides, folder=folder, progress=False

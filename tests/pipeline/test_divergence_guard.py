@@ -249,6 +249,7 @@ NETWORK = ["map.width=8", "map.depth=1"]
 SPLINES = {
     # ends in quasi-Newton steps
     "pair_map": ["map.cells=8", "constraints.triangles_from=0.8"],
+    "collection_map": ["map.cells=8", "constraints.triangles_from=0.9"],
     # has no others, and may end before its last step
     "param": ["map.cells=8", "optimizer.levels=[8]", "optimizer.steps=[]"],
 }
