@@ -28,14 +28,17 @@ class Stage:
     def __init__(self, title: str = "") -> None:
         self.titles = [title] if title else []
         self.step, self.figures, self.done, self.total = "", "", 0, 0
-        self.started = self.step_started = time.monotonic()
+        self.started = self.step_started = self.step_ended = time.monotonic()
         self._ended = threading.Event()
 
     def at(self, step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
         """Say which step the work is at: the one after ``done`` of ``total``, if it is counted;
         and figures that tell how it goes."""
+        now = time.monotonic()
         if step != self.step or done < self.done:
-            self.step_started = time.monotonic()
+            self.step_started = now
+        if done != self.done:
+            self.step_ended = now
         self.step, self.done, self.total, self.figures = step, done, total, figures
 
     def text(self, seconds: bool = True) -> str:
@@ -45,9 +48,11 @@ class Stage:
         if self.total:
             step += f" {min(self.done + 1, self.total)}/{self.total}"
         parts = [*self.titles, step, f"{now - self.started:.0f} s" if seconds else ""]
-        if self.total and self.done:
-            left = (now - self.step_started) / self.done * (self.total - self.done)
-            parts.append(f"about {left:.0f} s left")
+        if 0 < self.done < self.total:
+            # the step that is made may take longer than those before it
+            mean = (self.step_ended - self.step_started) / self.done
+            left = max(mean, now - self.step_ended) * (self.total - self.done)
+            parts.append(f"about {max(left, 1):.0f} s left")
         return "  ".join(part for part in (*parts, self.figures) if part)
 
     def show(self, console: Console) -> None:

@@ -63,12 +63,25 @@ def test_parts_are_named_and_the_step_before_them_comes_back():
         stages.at("pairs", 1, 4)
         with stages.part("inner"):
             stages.at("flips", 2, 3, figures="loss 1")
-            assert shown.text(seconds=False) == "outer  inner  flips 3/3  about 0 s left  loss 1"
+            assert shown.text(seconds=False) == "outer  inner  flips 3/3  about 1 s left  loss 1"
         assert shown.text(seconds=False).startswith("outer  pairs 2/4")
     finally:
         stages._current.reset(token)
     with stages.part("nothing is shown"):
         assert not stages.showing()
+
+
+def test_a_step_that_takes_longer_than_those_before_it_is_awaited():
+    begun = stages.Stage("work")
+    begun.at("steps", 1, 4)
+    begun.at("steps", 2, 4)
+    begun.step_started -= 4  # two steps, two seconds each
+    begun.step_ended -= 0.1
+    assert "about 4 s left" in begun.text()
+    begun.step_ended -= 30
+    assert "about 60 s left" in begun.text()
+    begun.at("steps", 4, 4)
+    assert "left" not in begun.text()
 
 
 def test_lines_keep_coming_however_long_it_lasts(often):
