@@ -170,15 +170,15 @@ class CollectionMap(ConstrainedMap):
         """The same of the one map that moves: of its pairs, and tensors (1, F, ...)."""
         some, phi = turn.some, self.phis[turn.number]
         image = self.map[turn.number](some.uv)
-        position, sides = phi(image), some.sides(image)
+        position, centres = phi(image), some.centres_on(image)[None]
         metric = first_fundamental_form(some.sides(position))
         parts = self.energy.parts(*turn.ends(metric), turn.at)
         evaluation = Evaluation(
-            some.centres_on(image)[None],
+            centres,
             some.centres_on(position)[None],
-            some.centres_on(image)[None],
+            centres,
             source=metric[None],
-            determinant=(sides.det() / some.determinant)[None],
+            determinant=some.relative(some.sides(image))[None],
             share=some.oriented[None],
         )
         return Distortion(self.energy, parts, turn.share), evaluation
@@ -216,8 +216,11 @@ class CollectionMap(ConstrainedMap):
             yield self.map
             return
         try:
+            corners = self.quadrature.corners(self.map)
             for i, h in enumerate(self.map):
-                self._turn = self.quadrature.turn(i, list(self.map))
+                if i:  # the one that moved
+                    corners[i - 1] = self.quadrature.taken_back(i - 1, self.map[i - 1])
+                self._turn = self.quadrature.turn(i, list(self.map), corners)
                 yield h
         finally:
             self._turn = None
@@ -259,7 +262,7 @@ class CollectionMap(ConstrainedMap):
         with torch.no_grad():
             image, jacobian = h.value_and_jacobian(x)  # type: ignore[operator]
             outer = phi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
-            determinant = some.sides(h(some.uv)).det() / some.determinant
+            determinant = some.relative(some.sides(h(some.uv)))
             excess = (determinant - torch.linalg.det(jacobian)).double()
         share = pairs * turn.share.double() / turn.share.sum()
         folding = scale * self.loss_weights.injectivity * some.oriented.double()

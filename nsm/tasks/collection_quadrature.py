@@ -83,19 +83,29 @@ class CollectionQuadrature(nn.Module):
         self.register_buffer("landmarks", landmarks, persistent=False)
         self.register_buffer("targets", targets, persistent=False)
 
+    def corners(self, maps: Sequence[nn.Module]) -> list[Tensor]:
+        """Those of all surfaces, :meth:`taken_back` by their maps."""
+        return [self.taken_back(j, h) for j, h in enumerate(maps)]
+
+    def _part(self, number: int) -> Triangles:
+        """The triangles of a surface that are taken."""
+        each: Sequence[Any] = list(self.each)
+        few = sum(len(one.faces) for one in each) <= MOST
+        most = MOST if few else MOST // len(each)
+        part: Triangles = each[number].take(most, most)
+        return part
+
     @torch.no_grad()
-    def turn(self, number: int, maps: Sequence[nn.Module]) -> Turn:
+    def turn(self, number: int, maps: Sequence[nn.Module], corners: list[Tensor]) -> Turn:
         """That of the map of a surface.
 
         Args:
             number: of the surface.
-            maps: h_j, around affine maps.
+            maps: h_j.
+            corners: of each surface, :meth:`taken_back` by its map as it is now.
         """
         each: Sequence[Any] = list(self.each)
-        few = sum(len(one.faces) for one in each) <= MOST
-        most = MOST if few else MOST // len(each)
-        parts = [one.take(most, most) for one in each]
-        corners = [self._taken_back(h, parts[j], j) for j, h in enumerate(maps)]
+        parts = [self._part(j) for j in range(len(each))]
         ends = torch.tensor([0, *(len(part.uv) for part in parts)]).cumsum(0).tolist()
         faces = torch.cat([part.faces + n for part, n in zip(parts, ends[:-1], strict=True)])
         some = triangles(torch.cat(corners), faces, torch.cat([part.points for part in parts]))
@@ -118,11 +128,17 @@ class CollectionQuadrature(nn.Module):
         at = At(centres[of], on_surfaces[of])
         return Turn(number, some, of, owner[of] == number, torch.cat(held), at)
 
-    def _taken_back(self, h: Any, part: Triangles, number: int) -> Tensor:
-        """h⁻¹ (V, 2) of corners, NaN where none is found; landmarks lie at their places.
+    @torch.no_grad()
+    def taken_back(self, number: int, h: Any) -> Tensor:
+        """h⁻¹ (V, 2) of a surface's corners, NaN where none is found; landmarks in their places.
 
         Where h misses a landmark, what brings it there must not fold unseen between the corners.
+
+        Args:
+            number: of the surface.
+            h: its map, around an affine one.
         """
+        part = self._part(number)
         exact, uv = copy.deepcopy(h).cpu().double(), part.uv.cpu().double()
         x = preimages(exact, uv, exact.back(uv), self.project)
         off = (exact(x) - uv).norm(dim=1, keepdim=True)

@@ -345,7 +345,8 @@ def test_a_collection_of_two_is_the_mean_of_both_pair_maps():
 def turned(names, number, **changes):
     """A collection at the triangles of its meshes, where the map of one surface has its turn."""
     module = collection(names, triangles_from=0.0, **changes)
-    module._turn = module.quadrature.turn(number, list(module.map))
+    maps = list(module.map)
+    module._turn = module.quadrature.turn(number, maps, module.quadrature.corners(maps))
     return module
 
 
@@ -379,7 +380,8 @@ def test_moved_triangles_are_those_that_the_map_makes_of_the_meshes():
         for p in module.map.parameters():
             p += 0.02 * torch.randn_like(p)
     for number, h in enumerate(module.map):
-        turn = module.quadrature.turn(number, list(module.map))
+        maps = list(module.map)
+        turn = module.quadrature.turn(number, maps, module.quadrature.corners(maps))
         own = turn.of[turn.outward].unique()
         corners = turn.some.uv[turn.some.faces[own]]
         torch.testing.assert_close(h(corners), MESH[0][MESH[1]], atol=1e-5, rtol=0)
