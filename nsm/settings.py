@@ -231,7 +231,8 @@ class PhiSettings:
         overrides: for maps, settings of the trainings of their neural surfaces, as in
             'phi.overrides=["map=residual","seed=1"]'.
         steps: for maps, steps of these trainings at most, where they start from a least-squares
-            fit; 0: the fit alone; null: as many as task=overfit makes.
+            fit; 0: those of experiment=fit, unless overrides change them; null: as many as
+            task=overfit makes.
         processes: for maps of several meshes, how many are prepared at once, each by a process on a
             CPU core of its own; null: as many as there are cores.
     """

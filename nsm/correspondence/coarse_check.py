@@ -23,7 +23,7 @@ _FACES = 500
 _SPREAD = 6  # landmarks among which the four at the cones are chosen
 _ROUND = Round(0, 5, 30)
 _EXCHANGED = 8  # landmarks at most of which two are exchanged: pairs are many
-_STRAINED = 10.0  # energy of a strained map: then the landmarks at the cones are left out, too
+_STRAINED = 10.0  # energy of a strained map: then other cones are tried, and more is left out
 _GOOD = 7.0  # energy below which the map needs no change, whatever distances between landmarks say
 _SETS = 12  # sets of four at the cones that are tried, until a map is good
 _BETTER = 0.8  # share of the energy with the first set, from which on another one is taken
@@ -155,7 +155,7 @@ class _Maps:
         found = self._trials(four)
         if found is None:
             return None
-        if found[1][0] > _GOOD:
+        if found[1][0] > _STRAINED:
             # cones tell the isotopy classes that are tried; the right one may not be among these
             other = self._better(found[1][0])
             changed = None if other is None else self._trials(other)

@@ -53,6 +53,8 @@ _ESSENTIAL = (
     "trainer",
     "seed",
 )
+# settings with which a map's surfaces are not those of experiment=fit
+_OF_THE_FIT = ("experiment", "encoding", "map", "trainer.max_steps")
 _HARDWARE = (
     "accelerator",
     "devices",
@@ -210,12 +212,15 @@ def _overfit_config(config: DictConfig, on: Domain) -> DictConfig:
         *(f"trainer.{key}={'null' if v is None else v}" for key, v in values.items()),
     ]
     overfit = compose_config([*overrides, *config.phi.overrides])
+    steps = config.phi.get("steps")  # absent in older run folders
+    said = {word.lstrip("+").partition("=")[0] for word in config.phi.overrides}
+    if steps is not None and overfit.map.get("linear_skip") == "fitted":
+        if steps == 0 and not any(key.startswith(_OF_THE_FIT) for key in said):
+            overfit = compose_config([*overrides, "experiment=fit", *config.phi.overrides])
+        elif "trainer.max_steps" not in said:
+            overfit.trainer.max_steps = min(steps, overfit.trainer.max_steps)
     with open_dict(overfit):
         overfit.domain = on.config
-    steps = config.phi.get("steps")  # absent in older run folders
-    said = any(word.lstrip("+").startswith("trainer.max_steps=") for word in config.phi.overrides)
-    if steps is not None and not said and overfit.map.get("linear_skip") == "fitted":
-        overfit.trainer.max_steps = min(steps, overfit.trainer.max_steps)
     return overfit
 
 
