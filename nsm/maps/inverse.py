@@ -12,8 +12,11 @@ from torch import Tensor, nn
 from nsm.maps.composition import PointMap
 
 _STEPS, _HALVINGS, _SHRINK = 30, 12, 0.5
+# share of the distance by which a step comes nearer at least: less is rounding, again and again
+_NEARER = 1e-3
 _EXACT = 1e-13
-_STARTS, _ENOUGH = 12, 1e-9
+_STARTS = 12
+_ENOUGH = 1e-7  # digits of single precision, which constants of h have
 
 
 @torch.no_grad()
@@ -52,7 +55,7 @@ def inverted(
             trial = x[index] + step[left]
             if project is not None:
                 trial = project(trial)
-            now = (targets[index] - h(trial)).norm(dim=1) < distance[left]
+            now = (targets[index] - h(trial)).norm(dim=1) < (1 - _NEARER) * distance[left]
             x[index[now]] = trial[now]
             moved[left[now]] = True
             left = left[~now]
@@ -73,10 +76,14 @@ def preimages(
     """Points x (N, 2) with h(x) = targets (N, 2), wherever they lie.
 
     Args:
-        h, targets, project: as for :func:`inverted`.
+        h, targets: as for :func:`inverted`.
+        project: where h maps Ω onto itself, from points (N, 2) to the nearest ones of Ω, for which
+            targets outside, by rounding, stand.
         nodes: (M, 2); Newton's method starts from the few whose images under h are nearest to a
             target, until one leads to it.
     """
+    if project is not None:
+        targets = project(targets)
     images = h(nodes)
     tree = cKDTree(images.cpu().numpy())
     _, near = tree.query(targets.cpu().numpy(), k=[*range(1, min(_STARTS, len(images)) + 1)])

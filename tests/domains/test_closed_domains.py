@@ -9,6 +9,7 @@ import trimesh
 from domains.orbifold.shapes import limbs, torus
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from interruption import interrupted
 from rich.console import Console
 
 import nsm
@@ -18,7 +19,6 @@ from nsm.domains.orbifold.cover import lifted_near
 from nsm.errors import NsmError
 from nsm.maps import LatticeSplineGrid, NeuralMap, SplineGrid, build_network, build_stored
 from nsm.pipeline import Given, make_task, run_task
-from nsm.results.callbacks import AtomicCheckpoint
 from nsm.results.metrics import overfit_metrics, pointwise_metrics, seam_gap
 from nsm.surfaces import shapes
 from nsm.tasks.least_squares import fit_linear_skip
@@ -351,20 +351,13 @@ def test_from_mesh_to_files_and_back(surface, tmp_path):
     assert kept.encoding.resolutions == phi.map.encoding.resolutions
 
 
-def test_an_interrupted_training_is_resumed(torus_like, tmp_path, monkeypatch):
+def test_an_interrupted_training_is_resumed(torus_like, tmp_path):
     words = ["domain=torus", "encoding.resolutions=[8]", "logger=none", "artefacts=false"]
     words += ["trainer.max_steps=8", "data.steps_per_epoch=4", "data.batch_size=64"]
     words += ["data.held_out=64", "trainer.threads=1", "trainer.progress=false"]
     config, given = compose_config(words), Given(surface=torus_like)
     whole = run_task(config, tmp_path / "whole", given)
-    written = AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(AtomicCheckpoint, "on_train_epoch_end", stop)
+    with interrupted():
         run_task(config, tmp_path / "cut", given)
     resumed = run_task(config, tmp_path / "cut", given, resuming=True)
     for before, after in zip(whole.map.parameters(), resumed.map.parameters(), strict=True):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from filelock import FileLock
+from interruption import interrupted
 from omegaconf import OmegaConf
 from safetensors.torch import load_file
 from tiny import TRAINING
@@ -22,7 +23,6 @@ from nsm.config import compose_config
 from nsm.pipeline import overfit
 from nsm.pipeline.batched import Call, batches, run_batched
 from nsm.pipeline.sweep_jobs import run_job
-from nsm.results.callbacks import AtomicCheckpoint
 
 TINY = [
     *TRAINING,
@@ -161,18 +161,11 @@ def test_each_job_leaves_what_it_would_alone(tmp_path, settings, monkeypatch):
         assert_as_alone(place, tmp_path / "alone" / str(number))
 
 
-def test_an_interrupted_batch_ends_as_one_that_was_not(tmp_path, settings, monkeypatch):
+def test_an_interrupted_batch_ends_as_one_that_was_not(tmp_path, settings):
     jobs = [{"optimizer.lr": 1e-3}, {"optimizer.lr": 1e-2, "seed": 1}]
     assert in_one_batch(calls("whole", settings, *jobs)) == [None, None]
     cut = calls("cut", settings, *jobs)
-    written = AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(AtomicCheckpoint, "on_train_epoch_end", stop)
+    with interrupted():
         in_one_batch(cut)
     shutil.copytree(tmp_path / "cut", tmp_path / "serial")
     assert in_one_batch(cut) == [None, None]

@@ -4,13 +4,13 @@ from functools import cache
 
 import pytest
 import torch
+from interruption import interrupted
 from tiny import results
 
 import nsm
 from nsm.config import compose_config
 from nsm.pipeline import Given, run_task
 from nsm.pipeline.checkpoints import stored_state
-from nsm.results.callbacks import AtomicCheckpoint
 
 WORDS = ["data.batch_size=64", "data.held_out=64", "data.steps_per_epoch=5", "logger=none"]
 WORDS += ["trainer.max_steps=20", "trainer.threads=1", "trainer.progress=false"]
@@ -49,16 +49,9 @@ def aged(state):
 
 
 @pytest.mark.parametrize("task", ["overfit", "pair_map"])
-def test_a_run_of_an_older_version_ends_as_one_of_this_version(task, tmp_path, monkeypatch):
+def test_a_run_of_an_older_version_ends_as_one_of_this_version(task, tmp_path):
     whole = run(task, tmp_path / "whole")
-    written = AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(AtomicCheckpoint, "on_train_epoch_end", stop)
+    with interrupted():
         run(task, tmp_path / "old")
     file = tmp_path / "old" / "last.ckpt"
     new = stored_state(file)

@@ -16,6 +16,7 @@ from itertools import permutations
 import pytest
 import torch
 from domains.orbifold.shapes import torus
+from interruption import interrupted
 from tiny import results
 
 import nsm
@@ -150,19 +151,8 @@ def test_a_rolled_back_training_resumes_to_the_same_weights(surface, tmp_path, m
 
 def cut(surface, folder, at):
     """Stop right after the checkpoint of a step."""
-    from nsm.results import callbacks
-
-    written = callbacks.AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        if trainer.global_step == at:
-            raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
-        with pytest.raises(KeyboardInterrupt):
-            run(surface, folder)
+    with interrupted(at):
+        run(surface, folder)
 
 
 # --- kill -9 -----------------------------------------------------------------------------------
@@ -248,8 +238,8 @@ MAP_WORDS += ["artefacts=false"]
 NETWORK = ["map.width=8", "map.depth=1"]
 SPLINES = {
     # ends in quasi-Newton steps
-    "pair_map": ["map.cells=8", "constraints.triangles_from=0.8"],
-    "collection_map": ["map.cells=8", "constraints.triangles_from=0.9"],
+    "pair_map": ["map.cells=8", "constraints.triangles_from=0.8", "optimizer.iterations=4"],
+    "collection_map": ["map.cells=8", "constraints.triangles_from=0.9", "optimizer.iterations=2"],
     # has no others, and may end before its last step
     "param": ["map.cells=8", "optimizer.levels=[8]", "optimizer.steps=[]"],
 }

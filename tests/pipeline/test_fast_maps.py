@@ -12,8 +12,9 @@ from nsm.energies import first_fundamental_form, symmetric_dirichlet
 from nsm.maps import Composition, build_analytic
 from nsm.pipeline import run_task
 from nsm.pipeline.task import Given
-from nsm.results import NeuralSurface, callbacks
+from nsm.results import NeuralSurface
 from nsm.surfaces.shapes import ring_mesh
+from tests.interruption import interrupted
 from tests.tiny import dome
 
 WORDS = [
@@ -82,19 +83,10 @@ def test_quasi_newton_steps_meet_the_landmarks(surfaces, tmp_path):
     assert summary["steps"] == 8 and not summary["faults"]["rollbacks"]
 
 
-def test_an_interrupted_fast_map_ends_at_the_same_result(surfaces, tmp_path, monkeypatch):
+def test_an_interrupted_fast_map_ends_at_the_same_result(surfaces, tmp_path):
     whole = run(surfaces, tmp_path / "whole")
-    written = callbacks.AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        if trainer.global_step == 2:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(at=2):
         run(surfaces, tmp_path / "parted")
-    monkeypatch.undo()
     resumed = run(surfaces, tmp_path / "parted", resuming=True)
     assert np.array_equal(resumed.image_uv, whole.image_uv)
 
@@ -165,8 +157,8 @@ def collection_of(surfaces, folder, **extra):
     settings = [
         "task=collection_map",
         *(w for w in WORDS if w.startswith(("domain=", "trainer.prog", "artef", "logger"))),
-        *("map.cells=8", "data.batch_size=256", "data.steps_per_epoch=2", "data.held_out=256"),
-        *("trainer.tabulated=64", "trainer.max_steps=6", "constraints.triangles_from=0.5"),
+        *("map.cells=8", "data.batch_size=256", "data.steps_per_epoch=1", "data.held_out=256"),
+        *("trainer.tabulated=64", "trainer.max_steps=4", "constraints.triangles_from=0.5"),
         *("optimizer.iterations=6", "certification.rounds=0"),
     ]
     first, second = (list(each) for each in zip(*MARKS, strict=True))
@@ -174,23 +166,12 @@ def collection_of(surfaces, folder, **extra):
     return run_task(compose_config(settings), folder, given, **extra)
 
 
-def test_a_collection_meets_its_landmarks_and_resumes_between_turns(
-    surfaces, tmp_path, monkeypatch
-):
+def test_a_collection_meets_its_landmarks_and_resumes_between_turns(surfaces, tmp_path):
     whole = collection_of(surfaces, tmp_path / "whole")
     assert whole.certificate["certified"]
     assert max(values_of(whole.metrics, "landmark_error_max_percent")) < 0.1
-    written = callbacks.AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        if trainer.global_step == 4:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(at=3):
         collection_of(surfaces, tmp_path / "parted")
-    monkeypatch.undo()
     resumed = collection_of(surfaces, tmp_path / "parted", resuming=True)
     for h, again in zip(whole.maps, resumed.maps, strict=True):
         assert all(torch.equal(w, again.state_dict()[key]) for key, w in h.state_dict().items())

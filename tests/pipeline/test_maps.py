@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from interruption import interrupted
 from rich.console import Console
 from tensor_checks import check_correspondences, check_tensors, check_weights
 from tiny import QUICK
@@ -352,7 +353,7 @@ def test_attributes_of_files_are_carried_by_the_command(here, tmp_path):
     assert carried.min() >= 0 and carried.max() <= 1 and carried.std() > 0.1
 
 
-def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch):
+def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path):
     _, f = made
     words = [*QUICK, "data.steps_per_epoch=10", "trainer.max_steps=20"]
     words += ["logger=none", "artefacts=false"]
@@ -364,19 +365,8 @@ def test_an_interrupted_map_ends_at_the_same_result(made, tmp_path, monkeypatch)
 
     whole = run(tmp_path / "whole")
     # the same, stopped in the middle: the checkpoint of step 10
-    from nsm.results import callbacks
-
-    written = callbacks.AtomicCheckpoint.on_train_epoch_end
-
-    def stop(self, trainer, module):
-        written(self, trainer, module)
-        if trainer.global_step == 10:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(callbacks.AtomicCheckpoint, "on_train_epoch_end", stop)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(at=10):
         run(tmp_path / "parted")
-    monkeypatch.undo()
     resumed = run(tmp_path / "parted", resuming=True)
     assert (resumed.image_uv == whole.image_uv).all()
 
