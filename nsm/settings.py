@@ -504,6 +504,8 @@ class Settings:
         seams: of task=param: edges along which the mesh is cut, as a list of pairs of vertices or a
             file of them; lines: the l lines of the OBJ file; uv: the borders of the islands of its
             texture coordinates. Several charts are flattened one by one and packed into an atlas.
+        baselines: of task=param: compute libigl's SLIM, ARAP, LSCM and harmonic maps of the same
+            cut mesh, too, for figures beside the result's. On a large mesh they take long.
         texture: of task=pair_map: an image for the source's texture coordinates; or own: the
             materials of its file. It is baked to the target, as target_textured.obj and .glb; the
             target's own texture, if it has one, to the source.
@@ -528,6 +530,7 @@ class Settings:
     template: str | None = None
     landmarks: str | list[Any] | dict[str, Any] | None = None
     seams: str | list[Any] | None = None
+    baselines: bool = False
     texture: str | None = None
     texture_size: Annotated[int, Range(1, 8192)] = 1024
     attributes: AttributesSettings = field(default_factory=AttributesSettings)

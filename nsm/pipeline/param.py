@@ -40,7 +40,7 @@ from nsm.tasks.least_squares import fitted_to_layout
 
 
 class ParamTask(Task):
-    """A map of a neural surface to the plane, with least distortion, beside libigl's methods."""
+    """A map of a neural surface to the plane, with least distortion."""
 
     module, data, result, defaults = Param, SurfaceData, Parameterization, "param"
     certified = True
@@ -117,7 +117,8 @@ class ParamTask(Task):
             return  # its charts are measured
         surface = self.surface
         maps = {**self._before, "nsm": result.uv}
-        for name, method in BASELINES.items():
+        wanted = self.config.get("baselines", False)  # absent in older run folders
+        for name, method in BASELINES.items() if wanted else ():
             at(name)
             try:
                 maps[f"{name} (libigl)"] = method(surface.vertices, surface.faces, surface.uv)

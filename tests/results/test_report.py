@@ -54,7 +54,7 @@ def runs(tmp_path_factory) -> Path:
         run(compose_config([*TINY, f"activation={activation}"]), sweep / name)
     Image.fromarray(np.full((40, 60, 3), 90, np.uint8)).save(sweep / "1" / "error.png")
     ready = f"phi.path={sweep / '1'}"
-    run(compose_config(["task=param", ready, *TINY]), folder / "flat")
+    run(compose_config(["task=param", ready, *TINY, "baselines=true"]), folder / "flat")
     ends = [f"source={sweep / '1'}", "target=sphere_cap"]
     run(compose_config(["task=pair_map", *ends, *TINY]), folder / "map")
     shutil.copytree(sweep / "1", folder / "interrupted")
