@@ -164,6 +164,7 @@ class ConstrainedMap(AtTriangles):
         return found
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        super().on_train_batch_end(outputs, batch, batch_idx)
         settings = self.constraints
         if not len(self.points) or self.ramp < 1:
             return

@@ -140,6 +140,7 @@ class Param(OneMeshMap):
         self._stop_if_converged()  # a resumed training may have been
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        super().on_train_batch_end(outputs, batch, batch_idx)
         self._stop_if_converged()
 
     def _stop_if_converged(self) -> None:

@@ -25,6 +25,7 @@ class Training(Microbatching):
         log_every: steps between two logged values; logging each step would take Lightning as long
             as the network takes for its work.
         batch: of the last evaluation of a training step.
+        figures: of that evaluation, if they are to be logged.
         compiled: calls evaluations of a training step in compiled form; None: uncompiled.
     """
 
@@ -36,6 +37,7 @@ class Training(Microbatching):
     log_every = 1
     compiled: Compiled | None = None
     batch: Any = None
+    figures: Mapping[str, Tensor] | None = None
 
     def pointwise(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
@@ -46,9 +48,10 @@ class Training(Microbatching):
         return super().pointwise(function, x)
 
     def log_terms(self, loss: Tensor, terms: Mapping[str, Term], **figures: Tensor) -> None:
-        """Log a training step, in the steps that the logger takes.
+        """Take the figures of a training step, in the steps that the logger takes.
 
-        Each term is logged as it is, ``train/NAME``, and times its weight, ``weighted/NAME``; the
+        They are logged at the step's end: a quasi-Newton step evaluates the loss many times. Each
+        term is logged as it is, ``train/NAME``, and times its weight, ``weighted/NAME``; the
         latter add up to ``train/loss``.
 
         Args:
@@ -60,12 +63,16 @@ class Training(Microbatching):
             return
         there = {name: pair for name, pair in terms.items() if isinstance(pair[1], Tensor)}
         values = {name: value for name, (_, value) in there.items()}
-        self.log_figures(
-            {
-                **{f"train/{name}": v for name, v in {**figures, **values, "loss": loss}.items()},
-                **{f"weighted/{name}": weight * value for name, (weight, value) in there.items()},
-            }
-        )
+        found = {
+            **{f"train/{name}": v for name, v in {**figures, **values, "loss": loss}.items()},
+            **{f"weighted/{name}": weight * value for name, (weight, value) in there.items()},
+        }
+        self.figures = {k: v.detach() for k, v in found.items() if isinstance(v, Tensor)}
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        if self.figures is not None:
+            self.log_figures(self.figures)
+        self.figures = None
 
     def log_figures(self, figures: Mapping[str, Any], batch_size: int | None = None) -> None:
         """Log figures under their names; means over batches weigh each by its size."""
