@@ -206,8 +206,7 @@ def section(results: dict[str, Any]) -> list[str]:
         f"CPU seconds of each stage on {results['machine']}, one thread, with an empty cache "
         "(`make bench-waiting MESHES=FOLDER`). Maps are from shrec07-384 to shrec07-388 with 21 "
         "landmarks; their neural surfaces are made side by side, so that the wait by the clock is "
-        "shorter, by experiment=fast as least-squares fits alone. Where there is no row for them, "
-        "they are in the rest. The neural surface and the flattening are of shrec07-384; by "
+        "shorter. The neural surface and the flattening are of shrec07-384; by "
         f"experiment=fit, of {LARGER}, which has 9,757 vertices.",
         "",
         "| stage | " + " | ".join(CASES[name] for name in cases) + " |",
