@@ -24,6 +24,7 @@ from PIL import Image
 
 import nsm
 from nsm.results import parameterization_picture
+from nsm.results.render import upright
 
 RESULTS = Path(__file__).parent / "results" / "maps"
 ANIMALS = ("shrec07-381", "shrec07-384", "shrec07-388", "shrec07-393")
@@ -31,6 +32,7 @@ PICTURES = Path(__file__).parent.parent / "docs" / "pictures"
 # the two energies of the paper
 ENERGIES = {"isometric": "symmetric_dirichlet", "conformal": "conformal"}
 STUDY = ANIMALS[1:3]
+UP = "-z"  # of the first of these
 DISC = "domain=disc"  # closed_maps.py compares it with domains without a seam
 ADAM = "experiment=adam"
 # one change from the default at a time, on one pair
@@ -103,6 +105,7 @@ def cases(meshes: Path) -> dict[str, Callable[[], dict[str, Any]]]:
     result: dict[str, Callable[[], dict[str, Any]]] = {
         "igea-sphere_cap": lambda: pair(str(meshes / "igea.ply"), "sphere_cap", None, []),
         "energy: conformal map": lambda: pair(*study, ["energy=conformal"]),
+        "energy: conformal map, Adam alone": lambda: pair(*study, [ADAM, "energy=conformal"]),
         "energy: flattening": lambda: by_energy(study[0]),
     }
     for group, variants in (("setting", VARIANTS), ("seam", SEAMS)):
@@ -142,7 +145,8 @@ def by_energy(file: str) -> dict[str, Any]:
         found["map_seconds"] += seconds
         maps[label] = flat.uv
     drawn = RESULTS / "flattening.png"
-    parameterization_picture(drawn, first.phi.surface, maps)
+    with upright(UP):
+        parameterization_picture(drawn, first.phi.surface, maps)
     with Image.open(drawn) as image:
         small = image.convert("RGB").resize((1200, 1200 * image.height // image.width))
         small.save(PICTURES / "paper-flattening.jpg", quality=85)
@@ -150,7 +154,12 @@ def by_energy(file: str) -> dict[str, Any]:
     return found
 
 
-MAPS_BY_ENERGY = {"isometric": "setting: default", "conformal": "energy: conformal map"}
+MAPS_BY_ENERGY = {
+    "isometric": "setting: default",
+    "isometric, Adam alone": "setting: Adam alone",
+    "conformal": "energy: conformal map",
+    "conformal, Adam alone": "energy: conformal map, Adam alone",
+}
 BY_ENERGY = {
     "symmetric_dirichlet_median": "D_iso, median",
     "symmetric_dirichlet_p95": "D_iso, 95th percentile",

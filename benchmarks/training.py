@@ -32,6 +32,10 @@ def surface_of(name: str, meshes: Path | None, **settings: Any) -> Surface:
     return Surface.load(meshes / MESHES[name] if meshes else name, **settings)
 
 
+# in results of surfaces, beside those of maps, which have flips before and after repair and a start
+NO_MAP = "none to count: a neural surface has no triangles that flip, and nothing is repaired"
+
+
 class Clock(Callback):
     """Stop after a budget of time; call back at marks, whose time does not count.
 
