@@ -266,6 +266,39 @@ def test_the_figures_of_the_papers_pictures_were_measured():
         assert any(f"{value:.{places}f}" == figure for value in values), figure
 
 
+def dictionaries(found, name=""):
+    """All dictionaries in what a JSON file holds, with the keys that lead to them."""
+    if isinstance(found, dict):
+        yield name, found
+    if isinstance(found, dict | list):
+        parts = found.items() if isinstance(found, dict) else enumerate(found)
+        for key, part in parts:
+            yield from dictionaries(part, f"{name}/{key}")
+
+
+def starts_in(name, found):
+    """Whether it has the figures of maps before their optimization, or is these."""
+    words = ("start_symmetric_dirichlet_median", "distortion_of_domain", "domain", "before")
+    return "as h starts" in name or any(word in found for word in words)
+
+
+def test_every_result_of_maps_has_the_start_and_flips_before_and_after_repair():
+    for file in sorted(RESULTS.rglob("*.json")):
+        every = list(dictionaries(json.loads(file.read_text())))
+        for name, found in every:
+            if "symmetric_dirichlet_median" in found and "nearest points" not in name:
+                flips = {"flipped_before_repair_percent", "flipped_percent"}
+                assert flips <= found.keys(), f"{file.name}{name}"
+        if any("symmetric_dirichlet_median" in found for _, found in every):
+            assert any(starts_in(*one) for one in every), file.name
+
+
+def test_results_of_surfaces_say_that_nothing_flips():
+    files = [RESULTS / "activation.json", RESULTS / "overfit.json", *RESULTS.glob("steps/*/*.json")]
+    for file in files:
+        assert "nothing is repaired" in json.loads(file.read_text())["flips"]
+
+
 def numbers(found):
     if isinstance(found, dict):
         found = list(found.values())
