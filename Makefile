@@ -45,8 +45,8 @@ bench-flattening: .venv/.nsm-dev
 # quarter of an hour.
 FORM ?= reduced
 bench-published: .venv/.nsm-dev
-	$(BIN)/python benchmarks/published.py --form $(FORM) --meshes $(MESHES)
-	$(if $(filter reduced,$(FORM)),$(BIN)/python benchmarks/published_changes.py --meshes $(MESHES))
+	$(BIN)/python benchmarks/published.py --form $(FORM) $(if $(MESHES),--meshes $(MESHES))
+	$(if $(filter reduced,$(FORM)),$(BIN)/python benchmarks/published_changes.py $(if $(MESHES),--meshes $(MESHES)))
 
 # A pair of animals by every means, with a picture: three minutes. MESHES as above.
 bench-baselines: .venv/.nsm-dev

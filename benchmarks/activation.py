@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from training import NO_MAP
 
 from nsm.domains import Surface
 from nsm.results import NeuralSurface, atomic_write, load_surface
@@ -37,6 +38,7 @@ SETTINGS = [
     "data.batch_size=500",
     "trainer.max_steps=5000",
     "trainer.log_pictures=0",
+    "up=-z",
 ]
 COLUMNS = {
     "rms_percent": "RMS distance, % of diagonal",
@@ -97,7 +99,8 @@ def main() -> None:
     with Image.open(arguments.folder / "sweep.png") as image:
         small = image.convert("RGB").resize((900, 900 * image.height // image.width))
         small.save(PICTURES / "activation-sweep.jpg", quality=85)
-    text = json.dumps({"surface": SURFACE, "settings": SETTINGS, "runs": results}, indent=1) + "\n"
+    found = {"surface": SURFACE, "settings": SETTINGS, "flips": NO_MAP, "runs": results}
+    text = json.dumps(found, indent=1) + "\n"
     atomic_write(RESULT, text.encode())
     atomic_write(RESULT.with_suffix(".md"), _table(results).encode())
     write_report([arguments.folder], arguments.folder / "report.html", "Activations")

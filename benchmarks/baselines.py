@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from maps import PICTURES, VARIANTS, at_start, mapped, study_of, table, values
+from maps import PICTURES, UP, VARIANTS, at_start, mapped, study_of, table, values
 from peers import figures, image_by_command, pair_of
 from PIL import Image
 
 from nsm.results import atomic_write
 from nsm.results.pair_pictures import distorted
 from nsm.results.pictures import checked, panels, save_figure
-from nsm.results.render import View
+from nsm.results.render import View, upright
 from nsm.surfaces.loading import load_mesh
 
 RESULT = Path(__file__).parent / "results" / "baselines.json"
@@ -135,7 +135,8 @@ def main() -> None:
     text = table(["map", *COLUMNS.values(), "seconds"], rows(found)) + "\n"
     atomic_write(RESULT.with_suffix(".md"), text.encode())
     drawn = RESULT.with_suffix(".png")
-    picture(drawn, f, images)
+    with upright(UP):
+        picture(drawn, f, images)
     with Image.open(drawn) as whole:
         small = whole.convert("RGB").resize((1600, 1600 * whole.height // whole.width))
         small.save(PICTURES / "paper-baselines.jpg", quality=85)

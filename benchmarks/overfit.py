@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from training import MESHES, Clock, OnTheClock, surface_of, train
+from training import MESHES, NO_MAP, Clock, OnTheClock, surface_of, train
 
 from nsm.config import compose_config
 from nsm.domains import Surface
@@ -80,6 +80,7 @@ def _store(entry: str, value: dict[str, Any], output: Path) -> None:
     # read again each time: two processes may write to one file
     results = json.loads(output.read_text()) if output.exists() else {"runs": {}}
     results["machine"] = {"processor": platform.machine(), "torch": torch.__version__}
+    results["flips"] = NO_MAP
     results["runs"][entry] = value
     results["runs"] = dict(sorted(results["runs"].items()))
     output.parent.mkdir(parents=True, exist_ok=True)

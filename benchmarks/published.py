@@ -7,7 +7,7 @@ states; --form full is for a GPU. It is measured after a time in which the defau
 where it stops itself.
 The recipe cuts each animal by itself, the default of the map both together.
 
-    python benchmarks/published.py --meshes FOLDER [--form full]
+    python benchmarks/published.py [--meshes FOLDER] [--form full]
 
 Seconds are the CPU time of one thread, or the time on the GPU. What is in the result file is not
 repeated.
@@ -53,16 +53,37 @@ class Form:
         label: of the tables.
         surface, pair: overrides beside experiment=paper.
         early: seconds after which a surface and the map are measured on the way.
+        for_gpu: whether all is trained on the GPU where there is one.
     """
 
     label: str
     surface: tuple[str, ...] = ()
     pair: tuple[str, ...] = ()
     early: tuple[float, float] = (16.0, 47.0)
+    for_gpu: bool = False
+
+    @property
+    def accelerator(self) -> str:
+        """Lightning's word for the hardware."""
+        return "gpu" if self.for_gpu and torch.cuda.is_available() else "cpu"
+
+    @property
+    def machine(self) -> str:
+        """What the seconds are of: the card's name, or one thread."""
+        if self.accelerator == "gpu":
+            return str(torch.cuda.get_device_name())
+        return "one thread of a CPU"
+
+    def seconds(self) -> float:
+        """CPU time of the process; on a GPU, time."""
+        if self.accelerator == "gpu":
+            torch.cuda.synchronize()
+            return time.perf_counter()
+        return time.process_time()
 
 
 FORMS = {
-    "full": Form("published recipe"),
+    "full": Form("published recipe", for_gpu=True),
     "reduced": Form(
         "published recipe, reduced: φ and ψ of 4 blocks of 32 for 6,000 steps each, h of 4 layers "
         "of 128 for 4,000 steps",
@@ -73,21 +94,13 @@ FORMS = {
 QUIET = ["logger=none", "artefacts=false", "trainer.progress=false", "domain=disc"]
 
 
-def seconds() -> float:
-    """CPU time of the process; on a GPU, time."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-        return time.perf_counter()
-    return time.process_time()
-
-
 class Store:
     """The result file, written after each entry."""
 
     def __init__(self, file: Path, form: Form) -> None:
         self.file = file
         self.found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-        self.found |= {"form": form.label, "machine": _machine(), "torch": torch.__version__}
+        self.found |= {"form": form.label, "machine": form.machine, "torch": torch.__version__}
 
     def __contains__(self, key: str) -> bool:
         return key in self.found
@@ -98,14 +111,8 @@ class Store:
         print(key, value.get("seconds"), flush=True)
 
 
-def _machine() -> str:
-    if torch.cuda.is_available():
-        return str(torch.cuda.get_device_name())
-    return "one thread of a CPU"
-
-
 def trained(
-    config: Any, inputs: tuple[Any, ...], surface: Surface, when: float, measured: Any
+    config: Any, inputs: tuple[Any, ...], surface: Surface, when: float, measured: Any, form: Form
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """Train by the published recipe to its own stop.
 
@@ -115,6 +122,7 @@ def trained(
         surface: of the samples.
         when: seconds after which it is measured for the first time.
         measured: from the module to its figures.
+        form: of the recipe.
 
     Returns:
         The module, its entry after those seconds, and that at its stop.
@@ -122,8 +130,9 @@ def trained(
     early: dict[str, Any] = {}
 
     def at_mark(module: Any, spent: float, step: int) -> None:
-        early.update(seconds=spent, steps=step, metrics=measured(module))
-        module.train()
+        place = module.device
+        early.update(seconds=spent, steps=step, metrics=measured(module.cpu()))
+        module.to(place).train()
 
     settings = config.trainer
     watch = GradientWatch(
@@ -132,8 +141,10 @@ def trained(
         settings.stop_window,
         summed=settings.stop_norm_of == "sum",
     )
-    clock = Clock([when, math.inf], at_mark)
-    trainer, module, _ = train(config, surface, [clock, watch], inputs=inputs)
+    clock = Clock([when, math.inf], at_mark, form.seconds)
+    trainer, module, _ = train(
+        config, surface, [clock, watch], inputs=inputs, accelerator=form.accelerator
+    )
     stop = {
         "seconds": clock.spent,
         "steps": trainer.global_step,
@@ -150,10 +161,13 @@ def _norm(watch: GradientWatch, config: Any, surface: Surface) -> float:
     return samples * sum(watch.recent) / max(1, len(watch.recent))
 
 
-def animals(folder: Path) -> tuple[list[str], list[Any], list[np.ndarray]]:
-    """The files of the two animals, their meshes, and the landmarks as vertices of each."""
-    files = [str(folder / f"{name}.off") for name in NAMES]
-    marks = [str(folder / "landmarks" / f"{name}.vts") for name in NAMES]
+def animals(folder: Path | None) -> tuple[list[str], list[Any], list[np.ndarray]]:
+    """The files of the two animals, or their names in the catalogue if there is no folder, their
+    meshes, and the landmarks as vertices of each."""
+    files = marks = list(NAMES)
+    if folder is not None:
+        files = [str(folder / f"{name}.off") for name in NAMES]
+        marks = [str(folder / "landmarks" / f"{name}.vts") for name in NAMES]
     meshes: list[Any] = [read_shape(file, DOMAINS["disc"], file) for file in files]
     return files, meshes, list(landmark_vertices(marks, meshes))
 
@@ -168,13 +182,14 @@ def overfitted(store: Store, surface: Surface, form: Form, folder: Path) -> Any:
         return overfit_metrics(surface, module.map.eval())
 
     if f"{name}/default" not in store:
-        start = seconds()
-        trainer, module, _ = train(compose_config(["domain=disc"]), surface, [])
-        entry = {"seconds": seconds() - start, "steps": trainer.global_step}
+        start = form.seconds()
+        config = compose_config(["domain=disc"])
+        trainer, module, _ = train(config, surface, [], accelerator=form.accelerator)
+        entry = {"seconds": form.seconds() - start, "steps": trainer.global_step}
         store.put(f"{name}/default", {**entry, "metrics": figures(module)})
     if f"{name}/published" not in store or not place.exists():
         config = compose_config(["experiment=paper", *form.surface])
-        module, early, stop = trained(config, (surface,), surface, form.early[0], figures)
+        module, early, stop = trained(config, (surface,), surface, form.early[0], figures, form)
         phi = NeuralSurface(surface, module.map.eval().requires_grad_(False), stop["metrics"], {})
         phi.save(place)
         store.put(f"{name}/published, on the way", early)
@@ -197,11 +212,12 @@ def mapped(
     pair = " → ".join(phi.surface.name for phi in phis)
     if f"{pair}/default" not in store:
         pairs = np.stack(landmarks, axis=1).tolist()
-        overrides = ["domain=disc", "trainer.max_steps=1", "certification.rounds=0"]
-        ready = nsm.map_pair(*files, pairs, overrides=overrides, progress=False)  # the surfaces
-        start = seconds()
-        f = nsm.map_pair(ready.source, ready.target, pairs, progress=False)
-        spent = seconds() - start
+        place = f"trainer.accelerator={form.accelerator}"
+        first = [place, "domain=disc", "trainer.max_steps=1", "certification.rounds=0"]
+        ready = nsm.map_pair(*files, pairs, overrides=first, progress=False)  # the surfaces
+        start = form.seconds()
+        f = nsm.map_pair(ready.source, ready.target, pairs, overrides=[place], progress=False)
+        spent = form.seconds() - start
         steps = f.config["trainer"]["max_steps"]
         store.put(f"{pair}/default", {"seconds": spent, "steps": steps, "metrics": f.metrics})
     if f"{pair}/published" in store:
@@ -217,7 +233,7 @@ def mapped(
 
     store.put(f"{pair}/before", {"seconds": 0.0, "steps": 0, "metrics": figures(built(task))})
     inputs = (*phis, landmarks)
-    _, early, stop = trained(config, inputs, phis[0].surface, form.early[1], figures)
+    _, early, stop = trained(config, inputs, phis[0].surface, form.early[1], figures, form)
     store.put(f"{pair}/published, on the way", early)
     store.put(f"{pair}/published", stop)
 
@@ -273,14 +289,14 @@ def tables(file: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--meshes", type=Path, required=True, help="folder with the mesh files")
+    parser.add_argument("--meshes", type=Path, help="folder with the mesh files; else fetched")
     parser.add_argument("--form", default="reduced", choices=list(FORMS))
     parser.add_argument("--folder", type=Path, default=RESULTS, help="of the result file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     quiet_lightning()
     form = FORMS[arguments.form]
-    card = f"-{_machine().replace(' ', '-')}" if torch.cuda.is_available() else ""
+    card = f"-{form.machine.replace(' ', '-')}" if form.accelerator == "gpu" else ""
     file = arguments.folder / f"published-{arguments.form}{card}.json"
     store, kept = Store(file, form), cache_folder() / "published" / file.stem
     files, meshes, landmarks = animals(arguments.meshes)

@@ -4,7 +4,7 @@ The map of published.py's reduced form is trained again, on its surfaces, with o
 training and fewer steps; the schedule is stretched to them, as it always is. Of each map the table
 has the figures at its end, and the share that each term has in the gradient.
 
-    python benchmarks/published_changes.py --meshes FOLDER [--only CHANGE ...]
+    python benchmarks/published_changes.py [--meshes FOLDER] [--only CHANGE ...]
 
 published.py comes first: it trains the surfaces. What is in the result file is not repeated.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from maps import table
-from published import FORMS, NAMES, QUIET, RESULTS, Store, animals, seconds
+from published import FORMS, NAMES, QUIET, RESULTS, Store, animals
 from rich.console import Console
 from training import samples_of, train
 
@@ -100,11 +101,11 @@ def changed(
         return dict(result.metrics)
 
     start = figures(built(task))
-    began = seconds()
+    began = time.process_time()
     inputs = (*phis, landmarks)
     trainer, module, _ = train(config, phis[0].surface, [], inputs=inputs)
     return {
-        "seconds": seconds() - began,
+        "seconds": time.process_time() - began,
         "steps": trainer.global_step,
         "start": start,
         "metrics": figures(module),
@@ -141,7 +142,7 @@ def tables(file: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--meshes", type=Path, required=True, help="folder with the mesh files")
+    parser.add_argument("--meshes", type=Path, help="folder with the mesh files; else fetched")
     parser.add_argument("--only", nargs="*", help="changes to train; all by default")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from candidates import exchanged, parted, register
 from rich.console import Console
-from training import MESHES, OnTheClock, surface_of, train
+from training import MESHES, NO_MAP, OnTheClock, surface_of, train
 
 from nsm.config import compose_config
 from nsm.pipeline import quiet_lightning
@@ -359,6 +359,7 @@ def main() -> None:
                     "topic": topic,
                     "trial": key,
                     "overrides": in_full(trials[key]),
+                    "flips": NO_MAP,
                     "torch": torch.__version__,
                     "machine": platform.machine(),
                     **trial(in_full(trials[key]), name, arguments.meshes),

@@ -332,7 +332,8 @@ class TrainerSettings:
         log_every: steps between two values in the logs.
         log_pictures: pictures of the surface or map in the logs, the first before the training and
             the last at its end.
-        log_meshes: the same as meshes, which TensorBoard shows in 3D; each takes 40 bytes a vertex.
+        log_meshes: the same as meshes of up to 100,000 vertices, for 3D in TensorBoard; each takes
+            40 bytes a vertex.
         log_histograms: histograms of weights and gradients in TensorBoard, as evenly.
     """
 
@@ -350,7 +351,7 @@ class TrainerSettings:
     gradient_clip: Weight | None = None
     log_every: Count = 25
     log_pictures: Whole = 6
-    log_meshes: Whole = 0
+    log_meshes: Whole = 2
     log_histograms: Whole = 6
 
 

@@ -280,17 +280,20 @@ class CollectionMapTask(Task):
         return {**said, "template": result.names[0]} if self.has_template else said
 
     def picture(self, module: Any) -> np.ndarray:
-        return map_image(self.surface, self.phis[-1].surface, self._in_the_last(module))
+        own, image = self._first_and_last(module)
+        return map_image(self.surface, self.phis[-1].surface, image, own)
 
     def mesh(self, module: Any) -> ColouredMesh:
-        image = self.phis[-1].surface.at(self._in_the_last(module))
-        return painted(image, self.surface.faces, self.surface.vertices)
+        own, image = self._first_and_last(module)
+        last = self.phis[-1].surface
+        return painted(last.at(image), self.surface.faces, self.surface.at(own))
 
-    def _in_the_last(self, module: Any) -> np.ndarray:
-        """Where the vertices of the first surface go in the last one's domain (V, 2), if h_0 is
-        taken for its start."""
-        start = self.starts[0].back(torch.as_tensor(self.surface.uv, dtype=torch.float32))
-        return evaluate(module.map[-1], start.numpy())
+    def _first_and_last(self, module: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Points of the common domain in the domains of the first surface and of the last, (V, 2)
+        each: no map is inverted. As h_0 starts they are the vertices of the first."""
+        uv = torch.as_tensor(self.surface.uv, dtype=torch.float32)
+        common = self.starts[0].back(uv).numpy()
+        return evaluate(module.map[0], common), evaluate(module.map[-1], common)
 
     def save(self, folder: Path, result: SurfaceCollection) -> None:
         super().save(folder, result)

@@ -21,6 +21,8 @@ from nsm.results.loggers import event_files, log_picture, loggers_of, takes_pict
 from nsm.results.meshes import ColouredMesh
 from nsm.tasks.ensemble import Ensemble, members
 
+_MOST_VERTICES = 100_000  # of a mesh in the logs: TensorBoard's page loads all of them
+
 
 class AtomicCheckpoint(Callback):
     """Keep the last state of the training after each epoch, whole at any moment.
@@ -213,7 +215,7 @@ class Pictures(Callback):
     def _mesh(self, loggers: Sequence[Logger], module: Any, step: int) -> None:
         writers = event_files(loggers)
         mesh = self.mesh(module) if writers else None
-        if mesh is None:
+        if mesh is None or len(mesh.vertices) > _MOST_VERTICES:
             return
         vertices, faces, colours = (torch.as_tensor(part)[None] for part in mesh)
         for writer in writers:

@@ -36,7 +36,7 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
                 if i != j:
                     figures = collection.metrics["pairs"][collection.pair_names[i, j]]
                     values[i, j] = figures.get(key, np.nan)
-        axes = figure.add_subplot(1, len(_SHOWN), n + 1)
+        axes = figure.add_subplot(1, len(shown), n + 1)
         axes.imshow(values, cmap="viridis_r")
         middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
         for i in range(k):

@@ -112,7 +112,8 @@ def distortion_picture(path: str | Path, f: SurfaceMap) -> None:
                 f"its image on {f.target.surface.name}",
             ),
             (np.ones((PANEL, PANEL, 3)), ""),
-        ]
+        ],
+        bar=True,
     )
     axes = figure.axes[2]
     axes.clear()
@@ -175,8 +176,18 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
     atomic_write(animation, data.getvalue())
 
 
-def map_image(source: Surface, target: Surface, image_uv: np.ndarray) -> np.ndarray:
-    """A quick picture (384, 384, 3) uint8: the source's checkerboard on its image."""
+def map_image(
+    source: Surface, target: Surface, image_uv: np.ndarray, uv: np.ndarray | None = None
+) -> np.ndarray:
+    """A quick picture (384, 384, 3) uint8: the source's checkerboard on its image.
+
+    Args:
+        source, target: the surfaces.
+        image_uv: (V, 2), where points go in the domain of the target.
+        uv: (V, 2), these points in the domain of the source, with its faces; its vertices by
+            default.
+    """
     image = target.at(image_uv)
     view = View(target.vertices, 384)
-    return np.round(255 * view.draw(image, source.faces, checked(source.uv))).astype(np.uint8)
+    drawn = view.draw(image, source.faces, checked(source.uv if uv is None else uv))
+    return np.round(255 * drawn).astype(np.uint8)

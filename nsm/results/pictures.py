@@ -63,7 +63,7 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
             zip((surface.vertices, evaluate(neural.map, surface.uv)), normals, strict=True)
         )
     ]
-    figure = panels([(source, f"{surface.name}: mesh"), (image, title)], below)
+    figure = panels([(source, f"{surface.name}: mesh"), (image, title)], below, bar=True)
     figure.colorbar(
         scale,
         cax=figure.add_axes((0.91, 0.55, 0.012, 0.35)),
@@ -175,19 +175,30 @@ def checked(uv: np.ndarray) -> Callable[[Blend], np.ndarray]:
     return lambda blend: checkerboard_at(blend(uv))
 
 
-def panels(*rows: list[tuple[np.ndarray, str]]) -> Any:
-    """A figure of pictures with their titles, in rows of equal length."""
+def panels(*rows: list[tuple[np.ndarray, str]], bar: bool = False) -> Any:
+    """A figure of pictures with their titles, in rows of equal length.
+
+    Args:
+        rows: pictures and titles.
+        bar: whether the right tenth of the figure is left free, for a colour bar.
+    """
     columns = len(rows[0])
     lines = max(title.count("\n") + 1 for row in rows for _, title in row)
     side, above = 5.1, 0.2 + 0.2 * lines  # inches of a picture, and of the titles above a row
     height = len(rows) * (side + above) + 0.05
-    figure = Figure(figsize=(5.5 * columns + 0.6, height), dpi=120)
+    width = (5.5 * columns + 0.6) if bar else 5.1 * columns + 0.2
+    figure = Figure(figsize=(width, height), dpi=120)
     for k, (image, title) in enumerate(panel for row in rows for panel in row):
         axes = figure.add_subplot(len(rows), columns, k + 1)
         axes.imshow(image, interpolation="antialiased")
         axes.set_title(title)
         axes.set_axis_off()
-    edges = {"left": 0.01, "right": 0.9, "top": 1 - above / height, "bottom": 0.05 / height}
+    edges = {
+        "left": 0.01,
+        "right": 0.9 if bar else 0.99,
+        "top": 1 - above / height,
+        "bottom": 0.05 / height,
+    }
     figure.subplots_adjust(**edges, wspace=0.02, hspace=above / side)
     return figure
 

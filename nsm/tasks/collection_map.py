@@ -160,7 +160,7 @@ class CollectionMap(ConstrainedMap):
         forms, determinants, images, positions = (
             part.transpose(0, 1) for part in self.pointwise(self._at, x)
         )
-        share = self._shares(forms.detach(), images.detach())
+        share = self._shares(x, forms.detach(), images.detach())
         i, j = self.ordered
         parts = self.energy.parts(forms[i], forms[j], At(images[i], positions[i]))
         evaluation = Evaluation(images, positions, images, source=forms, determinant=determinants)
@@ -195,13 +195,18 @@ class CollectionMap(ConstrainedMap):
         pairs, scale = (k * (k - 1), 1.0) if summed else (1, _SURFACES / k)
         return (pairs, scale, 1.0) if self._turn is None else (pairs, k / 2 * scale, 0.5)
 
-    def _shares(self, forms: Tensor, images: Tensor) -> Tensor:
-        """How much each sample counts for each source, (k, N).
+    @torch.no_grad()
+    def _shares(self, x: Tensor, forms: Tensor, images: Tensor) -> Tensor:
+        """How much each sample x (N, 2) counts for each source, (k, N).
 
-        Samples lie by the mean of the surfaces' areas: weights make it that of each source.
+        Samples lie by the mean of the surfaces' areas as the maps start: weights make it the area
+        of each source as it lies now. Otherwise moving all maps alike, which changes no map between
+        surfaces, would lower the mean by taking distorted parts to where few samples are.
         """
-        area = torch.linalg.det(forms).clamp(min=0).sqrt()
-        share = area / area.mean(dim=0).clamp(min=1e-12)
+        starts = torch.stack([h.before(x) for h in self.map])  # type: ignore[operator]
+        outer = batched(list(self.phis)).value_and_jacobian(starts)[1]
+        density = torch.linalg.det(first_fundamental_form(outer)).clamp(min=0).sqrt().mean(dim=0)
+        share = torch.linalg.det(forms).clamp(min=0).sqrt() / density.clamp(min=1e-12)
         if not self.exact:  # samples that a map sends out of Ω do not count
             share = share * inside(self.domain, images).all(dim=0)
         return share
@@ -235,7 +240,7 @@ class CollectionMap(ConstrainedMap):
             images, inner = batched(list(self.map)).value_and_jacobian(x.expand(k, -1, -1))
             positions, outer = batched(list(self.phis)).value_and_jacobian(images)
             forms = first_fundamental_form(outer @ inner)
-            share = self._shares(forms, images).double()
+            share = self._shares(x, forms, images).double()
             share *= pairs / (share.sum(dim=1, keepdim=True).clamp(min=1e-12) * k * (k - 1))
 
         def energy(i: int, j: Tensor) -> Tensor:

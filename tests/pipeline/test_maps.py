@@ -12,7 +12,7 @@ import trimesh
 from interruption import interrupted
 from rich.console import Console
 from tensor_checks import check_correspondences, check_tensors, check_weights
-from tiny import QUICK
+from tiny import QUICK, results
 
 import nsm
 from nsm.config import compose_config
@@ -414,6 +414,25 @@ def test_a_collection_maps_every_surface_to_every_other(trio):
         assert found == pytest.approx(median, rel=1e-5)
     assert trio.metrics["cycle_error_networks_mean_percent"] < 0.01
     assert trio.metrics["cycle_error_mean_percent"] < 0.2
+
+
+def test_the_picture_of_a_collection_is_that_of_the_map_not_of_one_h():
+    phis = results(3).neural
+    same = [phis[0], phis[0], phis[0]]
+    task = make_task(compose_config(["task=collection_map", "map.cells=8"]), Console())
+    task.use(same, [np.zeros(0, dtype=np.int64)] * 3)
+    module = built(task)
+    start = task.picture(module).astype(float)
+    with torch.no_grad():
+        for parameter in module.map.parameters():  # alike: the map remains the identity
+            bent = torch.linspace(-0.3, 0.3, parameter.numel()).sin()
+            parameter.add_(bent.reshape(parameter.shape))
+    together = task.picture(module).astype(float)
+    with torch.no_grad():
+        for parameter in module.map[0].parameters():
+            parameter.mul_(0)
+    apart = task.picture(module).astype(float)
+    assert abs(together - start).mean() < 0.3 * abs(apart - start).mean()
 
 
 def test_the_maps_of_a_collection_are_inverse_to_each_other(trio):

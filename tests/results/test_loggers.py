@@ -48,7 +48,7 @@ def runs(tmp_path_factory):
     """Two runs of one sweep, with all logs on the disk."""
     folder = tmp_path_factory.mktemp("runs")
     words = ["logger=both", "sampler.vertex_share=0"]
-    words += ["trainer.log_pictures=3", "trainer.log_meshes=2", "trainer.log_histograms=2"]
+    words += ["trainer.log_pictures=3", "trainer.log_histograms=2"]
     for rate, activation in ACTIVATIONS.items():
         own = [f"optimizer.lr={rate}", f"activation={activation}"]
         overfitted(folder / str(rate), *own, *words)
@@ -132,6 +132,19 @@ def test_pictures_are_those_of_the_start_and_of_the_end_and_between(runs):
     ]
     assert all(one.shape == (384, 384, 3) for one in pictures)
     assert (pictures[0] != pictures[2]).any()
+
+
+def test_large_meshes_are_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr("nsm.results.callbacks._MOST_VERTICES", 3)
+    overfitted(tmp_path, "logger=tensorboard", "artefacts=false", "trainer.log_pictures=0")
+    tags = events(tmp_path / "tensorboard").Tags()["tensors"]
+    assert all("_hparams_" in tag for tag in tags)
+
+
+@pytest.mark.parametrize("task", ["pair_map", "collection_map", "param"])
+def test_curves_of_held_out_points_have_several_points(task):
+    config = compose_config([f"task={task}"])
+    assert config.trainer.max_steps // config.data.steps_per_epoch >= 6
 
 
 def test_meshes_are_those_of_the_surface_as_it_learns(runs):

@@ -136,6 +136,7 @@ def test_curves_end_at_the_last_step(page):
     assert curves["val/rms_percent"]["steps"][-1] >= 19
     assert all(value > 0 for value in curves["train/loss"]["values"])
     assert curves["train/loss"]["seconds"][0] == 0
+    assert not any(name.startswith("figures/") for name in curves)
 
 
 def test_a_csv_log_gives_curves_too(runs, tmp_path):

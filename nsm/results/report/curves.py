@@ -15,6 +15,7 @@ from nsm.results.report.runs import short
 
 _POINTS = 500  # at most, per curve: more would only enlarge the page
 _NO_CURVES = ("hp_metric", "epoch")
+_FINAL = "figures/"  # one value each, at the end: the table has them
 
 
 class Curve(NamedTuple):
@@ -48,7 +49,7 @@ def _from_events(place: Path) -> dict[str, Curve]:
     reader.Reload()
     curves = {}
     for tag in reader.Tags()[SCALARS]:
-        if tag in _NO_CURVES:
+        if tag in _NO_CURVES or tag.startswith(_FINAL):
             continue
         # a resumed run repeats the steps after its last checkpoint: keep the later value
         events = {event.step: event for event in reader.Scalars(tag)}

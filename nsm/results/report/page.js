@@ -225,7 +225,7 @@
     if (!tags.length) return;
     const drawn = tags.filter((tag) => task.runs.some((run) => run.curves[tag]?.steps.length > 1));
     const first = ["val/rms_percent", "val/distortion"].find((tag) => drawn.includes(tag)) ??
-      drawn.find((tag) => tag.startsWith("val/")) ?? drawn.find((tag) => tag === "train/loss") ?? drawn[0] ?? tags[0];
+      drawn.find((tag) => tag.startsWith("val/")) ?? [...drawn, ...tags].find((tag) => tag === "train/loss") ?? drawn[0] ?? tags[0];
     const timed = task.runs.some((run) => Object.values(run.curves).some((curve) => curve.seconds));
     if (!tags.includes(choices.tag)) choices.tag = first;
     control("#curves", select("curve", tags, "tag", drawCurves),
