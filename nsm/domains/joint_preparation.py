@@ -28,6 +28,7 @@ from nsm.surfaces import topology
 from nsm.surfaces.cutting import Cut
 from nsm.surfaces.landmarks import MISSING
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
+from nsm.wording import number_of
 
 
 @dataclass(frozen=True)
@@ -232,9 +233,10 @@ def check_common_topology(
                     key=name,
                 )
             raise NsmError(
-                f"{name} has genus {genus} and {loops} boundary loops, {names[0]} genus "
-                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes, as "
-                "surface.fill_holes=true does with small ones, or remove handles until they agree",
+                f"{name} has genus {genus} and {number_of(loops, 'boundary loop')}, "
+                f"{names[0]} genus {found[0][0]} and {found[0][1]}: a map between them would tear; "
+                "fill holes, as surface.fill_holes=true does with small ones, or remove handles "
+                "until they agree",
                 kind="wrong_topology",
                 key=name,
             )
@@ -282,7 +284,8 @@ def _cut_alike(
         best = best_common_cut(*what)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     line = (
-        f"seam led along {best.seam} paths through {best.count} of {len(common[0])} landmarks, "
+        f"seam led along {best.seam} paths through {best.count} of "
+        f"{number_of(len(common[0]), 'landmark')}, "
         "the same on all meshes"
     )
 

@@ -15,6 +15,7 @@ from nsm.results.certificate import verdict
 from nsm.results.divergence_guard import DivergenceGuard
 from nsm.results.progress import TrainingProgress
 from nsm.settings import PRECISIONS
+from nsm.wording import number_of
 
 _SHARE = 10  # a further training has this part of the training's steps
 _OVERLAPS = "boundary_self_intersections"  # of a free boundary
@@ -55,7 +56,7 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
         rounds += 1
         say(
             f"{verdict(best.certificate)}; going on with stronger terms, "
-            f"{rounds} of {settings.rounds} times at most"
+            f"{rounds} of {number_of(settings.rounds, 'time')} at most"
         )
         try:
             _train_on(task, module, data)

@@ -23,6 +23,7 @@ from nsm.stages import stage
 from nsm.surfaces.landmark_files import to_json
 from nsm.surfaces.topology import boundary_loops
 from nsm.surfaces.validation import CleanMesh
+from nsm.wording import number_of
 
 AUTO = "auto"
 _ENOUGH = 4  # landmarks for common cones, completed only by sure ones
@@ -235,8 +236,8 @@ def _proposal(
         rows, scores, margin, sure = every.vertices, every.scores, every.margin, every.sure
     if alternative >= len(rows):
         raise NsmError(
-            f"proposal.alternative={alternative}: there are {len(rows)} proposals; give a number "
-            f"from 0 to {len(rows) - 1}",
+            f"proposal.alternative={alternative}: of {number_of(len(rows), 'proposal')}; give a "
+            f"number from 0 to {len(rows) - 1}",
             kind="out_of_range",
             key="proposal.alternative",
         )

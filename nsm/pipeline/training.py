@@ -35,6 +35,7 @@ from nsm.run_directories import is_temporary
 from nsm.settings import PRECISIONS
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble
+from nsm.wording import number_of
 
 CONFIG_FILE = "config.yaml"
 
@@ -280,7 +281,7 @@ def check_device(config: DictConfig) -> None:
     count = CUDAAccelerator.auto_device_count()
     if count < config.trainer.devices:
         if count:
-            reason = f"there are {count} GPUs; give trainer.devices={count} or fewer"
+            reason = f"torch finds {number_of(count, 'GPU')}; give trainer.devices={count} or fewer"
         else:
             reason = "torch finds no GPU; give device=cpu, or install a driver and torch for it"
         raise NsmError(
