@@ -74,6 +74,10 @@ def test_the_atlas_is_on_the_mesh_of_the_file(run):
     assert off.max() < 1e-6
 
 
+def test_the_glb_file_of_an_atlas_is_valid(run, valid_gltf):
+    assert valid_gltf(run[0]) == {"parameterized.glb"}
+
+
 def test_the_pattern_shows_every_chart_in_units_of_the_file(run):
     folder, atlas = run
     root = ElementTree.parse(folder / "pattern.svg").getroot()

@@ -113,6 +113,11 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         assert (folder / name).stat().st_size > 0, name
 
 
+def test_glb_files_of_a_map_are_valid(made, valid_gltf):
+    names = {"mapped.glb", "morph.glb", "source_with_target_uv.glb", "target_with_source_uv.glb"}
+    assert valid_gltf(made[0]) == names
+
+
 def test_the_image_of_a_closed_mesh_is_a_closed_mesh(made, files):
     folder, f = made
     ball = trimesh.load(files / "ball.obj", process=False)

@@ -258,6 +258,16 @@ def test_exported_meshes_carry_uv(tmp_path, ending):
     assert np.allclose(mesh.visual.uv, 0.5 * (surface.uv + 1), atol=1e-6)
 
 
+def test_colours_of_vertices_are_linear_in_glb(tmp_path):
+    surface = square()
+    grey = np.full((len(surface.vertices), 3), 0.5)
+    export_mesh(tmp_path / "m.glb", surface.vertices, surface.faces, None, colours=grey)
+    mesh = trimesh.load(tmp_path / "m.glb", process=False, force="mesh")
+    colours = mesh.visual.vertex_colors
+    assert set(colours[:, :3].ravel()) == {55}  # 255 ((0.5 + 0.055) / 1.055)^2.4
+    assert b'"metallicFactor":0.0' in (tmp_path / "m.glb").read_bytes()  # by default, a mirror
+
+
 def test_unknown_mesh_ending_is_refused(tmp_path):
     surface = square()
     with pytest.raises(NsmError) as refused:

@@ -26,7 +26,7 @@ from nsm.results import (
 from nsm.results.analytic import analytic_surface
 from nsm.results.render import UP_AXES
 from nsm.results.view.colours import as_lab, distinct_colours
-from nsm.results.view.glb import as_glb
+from nsm.results.view.glb import painted_glb
 from nsm.results.view.picking import hit, pick, pick_at
 from nsm.results.view.scene import PLAIN, POSITION, Paint, scene_of
 from nsm.surfaces.location import Places, locate
@@ -264,11 +264,12 @@ def test_a_mesh_for_the_browser_has_its_colours_and_normals(closed):
     shape = scene_of(closed).source
     grey = Paint(np.full((len(shape.vertices), 3), 0.5), None)
     for paint in (grey, Paint(None, shape.uv)):
-        data = as_glb(shape, shape.vertices, paint)
+        data = painted_glb(shape, shape.vertices, paint)
         length, kind = struct.unpack("<I4s", data[12:20])
         gltf = json.loads(data[20 : 20 + length])
         (part,) = gltf["meshes"][0]["primitives"]
-        assert set(part["attributes"]) == {"POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0"}
+        own = "COLOR_0" if paint.checkerboard is None else "TEXCOORD_0"
+        assert set(part["attributes"]) == {"POSITION", "NORMAL", own}
         material = gltf["materials"][part["material"]]
         assert material["doubleSided"]
         textured = "baseColorTexture" in material["pbrMetallicRoughness"]
