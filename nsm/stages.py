@@ -92,7 +92,8 @@ class Stage:
         def left() -> float:
             # work between this and what printed before it was silent too; 0.8: others may hold the
             # interpreter
-            return max(_OFTEN, _heard.last + 0.8 * QUIET_FOR - time.monotonic())
+            quiet_for = 0.8 * QUIET_FOR
+            return max(min(_OFTEN, quiet_for), _heard.last + quiet_for - time.monotonic())
 
         while not self._ended.wait(left()):
             console.print(self.text(), soft_wrap=True)

@@ -506,6 +506,7 @@ def test_textures_are_carried_both_ways_by_the_command(here, tmp_path):
 BAD = [
     ("landmarks=[[99999,1]]", "out_of_range", "a"),
     ("landmarks=[[1,1],[1,2]]", "duplicate_landmark", "a"),
+    ("source=twice.obj landmarks=[[0,0],[162,5]]", "duplicate_landmark", "twice"),
     ("landmarks=[a.vts,b.vts]", "different_lengths", "landmarks"),
     ("landmarks=nowhere.json", "missing_file", "nowhere.json"),
     ("landmarks=broken.json", "damaged_file", "broken.json"),
@@ -542,6 +543,11 @@ def bad_files(made, files, tmp_path_factory):
     (folder / "broken.json").write_text("[[1, 2")
     for name, mesh in (("a", "ball"), ("b", "egg")):
         shutil.copy(files / f"{mesh}.obj", folder / f"{name}.obj")
+    vertices, faces = (np.array(part) for part in load_mesh(folder / "a.obj")[:2])
+    corner = tuple(np.argwhere(faces == 0)[0])  # vertex 162 is a duplicate of vertex 0
+    faces[corner] = len(vertices)
+    twice = trimesh.Trimesh(np.vstack([vertices, vertices[:1]]), faces, process=False)
+    twice.export(folder / "twice.obj")
     return folder
 
 
