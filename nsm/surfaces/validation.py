@@ -227,7 +227,7 @@ def _split_edges(
     if repairs.repair is None:
         a, b = edges.pairs[int(edges.count.argmax())]
         where = f"{number_of(count, 'non-manifold edge')} (three or more faces), such as {a}-{b}"
-        reason = f"{where}; surface.repair=split cuts them apart, or remove inner faces yourself"
+        reason = f"{where}; surface.repair=split cuts the mesh apart there, or remove inner faces"
         raise error_in(name, "non_manifold", reason)
     log.append(f"cut apart at {number_of(count, 'non-manifold edge')}")
     # a fan of faces around a copy ends at cut edges, so that at most two faces share each of them
@@ -248,8 +248,9 @@ def _keep_component(
     if repairs.parts is not None:
         number = 0 if repairs.parts == "largest" else int(repairs.parts)
         if not 0 <= number < count:
-            last = f"0 to {count - 1}" if count > 1 else "0"
-            reason = f"surface.parts={number}: the mesh has {count}; give {last}, or largest"
+            last = {1: "0", 2: "0, 1"}.get(count, f"0 to {count - 1}")
+            has = f"the mesh has {number_of(count, 'part')}"
+            reason = f"surface.parts={number}: {has}; give {last} or largest"
             raise error_in(name, "out_of_range", reason)
         part = int(order[number])
         log.append(f"1 of {count} connected components kept, {100 * share[part]:.2f} % of the area")
