@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from tiny import NETWORK, stirred
 
 from nsm.domains import Disc, Surface
 from nsm.errors import NsmError
@@ -195,6 +196,28 @@ def test_a_point_and_its_image_have_one_colour(f):
         colours[1].colours, scene.target.faces
     )
     assert there == pytest.approx(at.take(colours[0].colours, scene.source.faces), abs=0.02)
+
+
+def test_no_triangle_of_a_closed_target_goes_around_the_domain():
+    ends = []
+    for k in range(2):
+        ball = trimesh.creation.icosphere(subdivisions=3)
+        turned = trimesh.transformations.rotation_matrix(k, [1, 2, 3])[:3, :3]
+        points = ball.vertices @ turned * [1, 1, 1.3]
+        surface = Surface.from_arrays(points, ball.faces, domain="orbifold")
+        ends.append(NeuralSurface(surface, stirred(NeuralMap(out_dim=3, **NETWORK))))
+    h = stirred(ends[0].surface.domain.equivariant(NeuralMap(out_dim=2, **NETWORK)))
+    scene = scene_of(SurfaceMap(*ends, h, np.zeros((0, 2), int)))
+    for name in ("checkerboard of the source", "checkerboard of the target"):
+        own, carried = (paint.checkerboard for paint in scene.paint(name))
+        faces = scene.target.faces
+        assert carried.shape == (len(faces), 3, 2)
+        assert np.abs(carried - carried[:, :1]).max() < 0.7  # the domain is 2 wide
+        values = scene.transferred(own)[faces].reshape(-1, 2)
+        same = scene.lift(carried.reshape(-1, 2), values)
+        np.testing.assert_allclose(same, values, atol=1e-9)
+        data = painted_glb(scene.target, scene.target.vertices, scene.paint(name)[1])
+        assert len(data) > 3 * len(faces) * 8 * 4  # a vertex for each corner
 
 
 def test_colours_follow_the_scale(f):
