@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+VERTICES, FACES = 34962, 34963  # what a view of the buffer is for
+
 
 def as_glb(
     vertices: np.ndarray,
@@ -43,6 +45,18 @@ def as_glb(
         opaque = np.column_stack([linear, np.ones(len(linear))])
         visual.vertex_attributes["color"] = np.rint(255 * opaque).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
-    data = trimesh.Scene(mesh).export(file_type="glb", include_normals=normals is not None)
+    data = trimesh.Scene(mesh).export(
+        file_type="glb", include_normals=normals is not None, tree_postprocessor=_say_targets
+    )
     assert isinstance(data, bytes)
     return data
+
+
+def _say_targets(tree: dict[str, Any]) -> None:
+    """Say of the buffer's views whether they hold vertices or faces, as the format advises."""
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            uses = [(primitive["indices"], FACES)]
+            uses += [(accessor, VERTICES) for accessor in primitive["attributes"].values()]
+            for accessor, use in uses:
+                tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"] = use
