@@ -463,4 +463,9 @@ def test_landmarks_are_drawn_with_their_numbers(tmp_path):
     landmarks_picture(files[1], surfaces, [np.full(4, -1)] * 2)
     with_marks, without = (np.asarray(Image.open(f).convert("RGB"), dtype=int) for f in files)
     assert np.ptp(without, axis=2).max() < 10  # grey
-    assert (np.ptp(with_marks, axis=2) > 100).sum() > 50  # spheres
+    marked = np.ptp(with_marks, axis=2) > 100
+    assert marked.sum() > 50  # spheres
+    landmarks_picture(files[1], surfaces, [ids, np.array([0, 10, 20, 30])])
+    every = np.asarray(Image.open(files[1]).convert("RGB"), dtype=int)
+    # those that a surface lacks do not change the colours of the others
+    assert (every[marked] == with_marks[marked]).all(axis=1).mean() > 0.95
