@@ -14,6 +14,7 @@ from hydra.errors import HydraException
 from nsm.errors import NsmError
 from nsm.migration import check_override
 from nsm.settings import conf_folder
+from nsm.wording import number_of
 
 # settings that are files or folders: `~` stands for the home folder in them, and signs that Hydra's
 # grammar reserves are quoted for the user
@@ -64,7 +65,7 @@ def with_task(words: Sequence[str]) -> list[str]:
         most, keys = 1, [f"surface={shape}" for shape in shapes[:1]]
     if len(shapes) > most or len(files) > ("map" in task):
         raise NsmError(
-            f"{task}: {len(inputs)} inputs; it takes {most} surface{'s' if most > 1 else ''}"
+            f"{task}: {number_of(len(inputs), 'input')}; it takes {number_of(most, 'surface')}"
             f"{' and a file of landmarks' if 'map' in task else ''}",
             kind="wrong_inputs",
             key=task,

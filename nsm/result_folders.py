@@ -19,6 +19,7 @@ from nsm.results import (
 from nsm.results.parameterization_atlas import FILE as ATLAS
 from nsm.results.parameterization_atlas import ParameterizationAtlas, load_atlas
 from nsm.sweeps import is_complete
+from nsm.wording import number_of
 
 
 def load(
@@ -69,8 +70,7 @@ def _no_result(folder: Path) -> str:
     if within:
         give = "one of them, for example" if len(within) > 1 else "it:"
         newest = max(within, key=lambda place: (place / "metrics.json").stat().st_mtime)
-        runs = f"{len(within)} run{'s' if len(within) > 1 else ''}"
-        return f"a folder of {runs}; give {give} {newest}"
+        return f"a folder of {number_of(len(within), 'run')}; give {give} {newest}"
     if (folder / "config.yaml").exists():
         return f"an unfinished run; nsm resume={folder} continues it"
     return "no run there; give the folder of a run"

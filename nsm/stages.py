@@ -8,14 +8,36 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
+from weakref import WeakSet
 
-from rich.console import Console
+from rich.console import Console, ConsoleRenderable, RenderHook
 
 # seconds without a line after which one is printed where there is no terminal
 QUIET_FOR = 2.0
 _OFTEN = 0.2  # seconds between two updates of one line, or two reports of another process
 
 T = TypeVar("T")
+
+
+class _Heard(RenderHook):
+    """When a line was last printed, by whatever part of the program."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+        self.consoles: WeakSet[Console] = WeakSet()
+
+    def listen(self, console: Console) -> None:
+        """Notice what a console prints from now on."""
+        if console not in self.consoles:
+            self.consoles.add(console)
+            console.push_render_hook(self)
+
+    def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
+        self.last = time.monotonic()
+        return renderables
+
+
+_heard = _Heard()
 
 
 class Stage:
@@ -44,16 +66,19 @@ class Stage:
     def text(self, seconds: bool = True) -> str:
         """Titles, step, ``seconds`` so far, the time left of a step that is counted, figures."""
         now = time.monotonic()
-        step = self.step
-        if self.total:
-            step += f" {min(self.done + 1, self.total)}/{self.total}"
-        parts = [*self.titles, step, f"{now - self.started:.0f} s" if seconds else ""]
+        so_far = f"{now - self.started:.0f} s" if seconds else ""
+        parts = [*self.titles, self.numbered_step(), so_far]
         if 0 < self.done < self.total:
             # the step that is made may take longer than those before it
             mean = (self.step_ended - self.step_started) / self.done
             left = max(mean, now - self.step_ended) * (self.total - self.done)
             parts.append(f"about {max(left, 1):.0f} s left")
         return "  ".join(part for part in (*parts, self.figures) if part)
+
+    def numbered_step(self) -> str:
+        """The step that the work is at, with its number if steps are counted."""
+        number = f" {min(self.done + 1, self.total)}/{self.total}" if self.total else ""
+        return self.step + number
 
     def show(self, console: Console) -> None:
         """Show it until it ends: a line that is updated on a terminal, plain lines elsewhere."""
@@ -62,7 +87,15 @@ class Stage:
                 while not self._ended.wait(_OFTEN):
                     status.update(self.text())
             return
-        while not self._ended.wait(QUIET_FOR * 0.8):  # 0.8: others may hold the interpreter
+        _heard.listen(console)
+
+        def left() -> float:
+            # work between this and what printed before it was silent too; 0.8: others may hold the
+            # interpreter
+            quiet_for = 0.8 * QUIET_FOR
+            return max(min(_OFTEN, quiet_for), _heard.last + quiet_for - time.monotonic())
+
+        while not self._ended.wait(left()):
             console.print(self.text(), soft_wrap=True)
 
     def end(self) -> None:
@@ -114,18 +147,20 @@ def stage(console: Console, title: str) -> Iterator[None]:
 
 @contextmanager
 def part(title: str) -> Iterator[None]:
-    """Name a part of the work that is shown, if there is any, for as long as it lasts."""
+    """Name a part of the work that is shown, if there is any, for as long as it lasts: after the
+    step that it is within, if steps are counted."""
     outer = _current.get()
     if outer is None:
         yield
         return
     before = outer.step, outer.done, outer.total
-    outer.titles.append(title)
+    titles = outer.titles
+    outer.titles = [*titles, *([outer.numbered_step()] if outer.total else []), title]
     outer.at("")
     try:
         yield
     finally:
-        outer.titles.pop()
+        outer.titles = titles
         outer.at(*before)
 
 

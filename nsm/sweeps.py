@@ -15,6 +15,8 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
+from nsm.wording import number_of
+
 # settings that do not change what a job leaves
 _INCIDENTAL = {"resume"}
 _LONGEST = 60  # characters of a folder's name before its hash
@@ -121,7 +123,8 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     """The outcome of a sweep in one line."""
     complete = [o for o in outcomes if o.error is None]
     before = sum(o.before for o in complete)
-    text = f"{len(outcomes)} jobs in {outcomes[0].folder.parent}: {len(complete)} complete"
+    jobs = number_of(len(outcomes), "job")
+    text = f"{jobs} in {outcomes[0].folder.parent}: {len(complete)} complete"
     if before:
         text += f" ({before} of them before)"
     failed = len(outcomes) - len(complete)

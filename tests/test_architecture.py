@@ -23,7 +23,7 @@ ROOMS = [
 # what every room may import
 COMMON = {
     *("errors", "instantiation", "optional_dependencies", "settings"),
-    *("side_by_side", "stages"),
+    *("side_by_side", "stages", "wording"),
 }
 # rooms that stand for themselves: meshes in numpy, and maps in torch
 INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}

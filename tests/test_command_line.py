@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+from tiny import results
 
 import nsm
 from nsm.command_line import prepared_overrides, with_task
@@ -108,6 +109,30 @@ def test_a_missing_gpu_is_told_before_the_preparation(monkeypatch):
     with pytest.raises(NsmError) as caught:
         nsm.map_pair("no such file.obj", "nor this.obj", device="cuda")
     assert (caught.value.kind, caught.value.key) == ("no_such_device", "trainer.accelerator")
+
+
+def test_a_result_is_moved_to_no_gpu_that_is_missing(monkeypatch):
+    from pytorch_lightning.accelerators import CUDAAccelerator
+
+    from nsm.results.devices import as_device
+
+    for count, given, kind in (
+        (0, "cuda", "no_such_device"),
+        (0, "gpu", "no_such_device"),
+        (1, "cuda:1", "no_such_device"),
+        (1, "tpu 3", "unknown_option"),
+    ):
+        monkeypatch.setattr(CUDAAccelerator, "auto_device_count", lambda count=count: count)
+        with pytest.raises(NsmError) as caught:
+            as_device(given)
+        assert (caught.value.kind, caught.value.key) == (kind, "device")
+    assert (as_device("cuda").type, as_device("cpu").type) == ("cuda", "cpu")
+    monkeypatch.setattr(CUDAAccelerator, "auto_device_count", lambda: 0)
+    pair = results(rings=3).pair
+    for one in (pair, pair.source):
+        with pytest.raises(NsmError) as caught:
+            one.to("cuda")
+        assert caught.value.kind == "no_such_device"
 
 
 def test_version_and_names(here):

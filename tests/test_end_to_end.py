@@ -77,6 +77,10 @@ def test_the_run_folder_is_complete(finished):
         assert strip.width % strip.height == 0 and strip.width >= 2 * strip.height
 
 
+def test_the_glb_file_is_valid(finished, valid_gltf):
+    assert valid_gltf(finished[1]) == {"reconstruction.glb"}
+
+
 def test_the_result_is_the_shape(finished):
     _, folder, _ = finished
     metrics = json.loads((folder / "metrics.json").read_text())["metrics"]

@@ -105,9 +105,10 @@ def test_help_folds_no_setting(here, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "80")
     lines = here("--help", name).stdout.splitlines()
     found = [group for group in groups() if group.name == name]
+    run, choices = composed()
     for group in found:
         for option in group.options:
-            for s in option_settings(name, option):
+            for s in option_settings(name, option, run if choices.get(name) == option else None):
                 assert any(f" {s.key}={s.value} " in f"{line} " for line in lines), s
     if not found:
         for s in plain_settings(composed()[0]):

@@ -63,7 +63,9 @@ def test_parts_are_named_and_the_step_before_them_comes_back():
         stages.at("pairs", 1, 4)
         with stages.part("inner"):
             stages.at("flips", 2, 3, figures="loss 1")
-            assert shown.text(seconds=False) == "outer  inner  flips 3/3  about 1 s left  loss 1"
+            assert shown.text(seconds=False) == (
+                "outer  pairs 2/4  inner  flips 3/3  about 1 s left  loss 1"
+            )
         assert shown.text(seconds=False).startswith("outer  pairs 2/4")
     finally:
         stages._current.reset(token)
@@ -135,3 +137,19 @@ def test_works_in_turn_are_counted_and_named(monkeypatch):
     monkeypatch.setattr(stages, "at", lambda *of: told.append(of))
     stages.done_in_turn("files", {"a": lambda: done.append(1), "b": lambda: done.append(2)})
     assert done == [1, 2] and told == [("files", 0, 2, "a"), ("files", 1, 2, "b")]
+
+
+def test_silence_before_a_stage_counts_and_lines_of_others_end_it(monkeypatch):
+    monkeypatch.setattr(stages, "QUIET_FOR", 50.0)
+    console = Console(file=io.StringIO())
+    assert shown(console) == ""
+    console.print("a line")
+    monkeypatch.setattr(stages._heard, "last", time.monotonic() - 50)
+    with stages.stage(console, "work"):
+        end = time.monotonic() + 20  # a busy machine takes its time
+        while "work" not in console.file.getvalue() and time.monotonic() < end:
+            time.sleep(0.05)
+    assert console.file.getvalue().count("work") == 1
+    monkeypatch.setattr(stages._heard, "last", time.monotonic() - 50)
+    console.print("another line")
+    assert shown(console).endswith("another line\n")

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
 from rich.console import Console
 
 from nsm.arguments import Arguments
@@ -135,21 +134,14 @@ def _given(files: list[str], meshes: list[Mesh], cleaned: list[CleanMesh]) -> La
     """The landmarks of files, in all formats of tasks, also those that one mesh alone has."""
     from nsm.correspondence.landmark_list import LandmarkList
     from nsm.pipeline.landmark_inputs import all_landmarks
-    from nsm.surfaces.landmarks import MISSING, as_vertices
+    from nsm.surfaces.landmarks import as_vertices, kept_landmarks
 
     given = files if len(files) > 1 else files[0]
     lists, names = all_landmarks(given, [mesh.name for mesh in meshes])
     ids = []
     for mesh, clean, of_one in zip(meshes, cleaned, lists, strict=True):
         vertex = as_vertices(of_one, mesh.vertices, mesh.faces, mesh.name).vertex
-        local = np.where(vertex == MISSING, MISSING, clean.merged[vertex])
-        for k in np.flatnonzero((local < 0) & (vertex != MISSING)).tolist():
-            raise NsmError(
-                f"{mesh.name}: landmark {k}, vertex {vertex[k]}, is not on the part that is kept",
-                kind="not_on_surface",
-                key=mesh.name,
-            )
-        ids.append(local)
+        ids.append(kept_landmarks(clean, vertex, mesh.name))
     return LandmarkList(len(meshes), ids, names)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from nsm.arguments import Arguments
 from nsm.commands import add_trust
 from nsm.loading_libraries import loading_libraries
+from nsm.wording import number_of
 
 
 def main(arguments: list[str]) -> None:
@@ -47,4 +48,4 @@ def main(arguments: list[str]) -> None:
 
     runs, incomplete = write_report(given.folders, given.output, given.title, given.trust, given.up)
     others = f", {incomplete} incomplete or damaged" if incomplete else ""
-    print(f"{runs} run{'s' if runs != 1 else ''}{others}: {given.output}")
+    print(f"{number_of(runs, 'run')}{others}: {given.output}")

@@ -17,6 +17,8 @@ from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, quick_scores, table
 from nsm.correspondence.search import Candidate, Round, trained
 from nsm.errors import NsmError
+from nsm.stages import counted, part
+from nsm.wording import number_of
 
 FEWEST = 4  # landmarks, at the cones
 _FACES = 500
@@ -157,7 +159,8 @@ class _Maps:
             return None
         if found[1][0] > _STRAINED:
             # cones tell the isotopy classes that are tried; the right one may not be among these
-            other = self._better(found[1][0])
+            with part("strongly distorted"):
+                other = self._better(found[1][0])
             changed = None if other is None else self._trials(other)
             if other is not None and changed is not None:
                 four, found, cones = other, changed, tuple(other.tolist())
@@ -189,7 +192,7 @@ class _Maps:
         """The four landmarks (4,) for the cones with which the map through all of them is much less
         distorted than with the first set; None if there are none."""
         best, found = _BETTER * energy, None
-        for four in self.sets[1:_SETS]:
+        for four in counted("other cones", list(self.sets[1:_SETS])):
             energies = self._energies(four, [self._through_all])
             if energies is not None and energies[0] < best:
                 best, found = energies[0], four
@@ -259,7 +262,9 @@ class _Maps:
                     found.append(candidate)
                     drawn.append(pairs[trial.kept])
         best = [np.inf] * len(trials)
-        for k, candidate in zip(number, trained(found, _ROUND, drawn=drawn), strict=True):
+        with part(number_of(len(found), "map")):
+            after = trained(found, _ROUND, drawn=drawn)
+        for k, candidate in zip(number, after, strict=True):
             best[k] = min(best[k], candidate.energy)
         return best
 

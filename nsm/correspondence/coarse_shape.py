@@ -11,6 +11,7 @@ from nsm.correspondence.tips import tips_of
 from nsm.domains.orbifold.cones import decimated
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.wording import number_of
 
 _FACES = 1000
 _TIPS = 8
@@ -109,7 +110,7 @@ def coarse_shape(
             tips = np.concatenate([fixed, others])
     if len(tips) < 4:
         raise NsmError(
-            f"the surface has {len(tips)} tips, a proposal needs four; give landmarks",
+            f"the surface has {number_of(len(tips), 'tip')}, a proposal needs four; give landmarks",
             kind="no_proposal",
             key="landmarks",
         )

@@ -9,6 +9,7 @@ import numpy as np
 from nsm.correspondence.coarse_shape import coarse_shape
 from nsm.correspondence.search import Candidate, Round, through_four, trained
 from nsm.errors import NsmError
+from nsm.wording import number_of
 
 _ROUND = Round(8, 8, 60)
 _MOST = 8  # landmarks among which the four at the cones are chosen
@@ -50,7 +51,7 @@ def previewed(
     ours, theirs = (np.asarray(ids, dtype=np.int64) for ids in landmarks)
     if len(ours) < 4:
         raise NsmError(
-            f"{len(ours)} landmarks; a coarse map needs four",
+            f"{number_of(len(ours), 'landmark')}; a coarse map needs four",
             kind="too_few_landmarks",
             key="landmarks",
         )

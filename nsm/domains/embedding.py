@@ -26,6 +26,7 @@ from nsm.errors import NsmError
 from nsm.stages import at
 from nsm.surfaces import topology
 from nsm.surfaces.geometry import triangle_distortion
+from nsm.wording import number_of
 
 if TYPE_CHECKING:
     from nsm.domains.base import BoundedDomain, Keys
@@ -172,8 +173,8 @@ def _tutte_start(
     flipped = flipped_triangles(start, faces)
     if flipped:
         raise NsmError(
-            f"{name}: {flipped} triangles flip in Tutte's embedding, as long thin parts exceed "
-            "floating point; give seam_vertices at the tips of long parts",
+            f"{name}: Tutte's embedding flips {number_of(flipped, 'triangle')}, as long thin parts "
+            "exceed floating point; give seam_vertices at the tips of long parts",
             kind="not_injective",
             key=name,
         )

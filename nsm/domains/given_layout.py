@@ -15,6 +15,7 @@ from nsm.surfaces.cutting import Cut, disc_seam, seam_pairs, split_chords
 from nsm.surfaces.geometry import triangle_distortion
 from nsm.surfaces.seams import uv_seams
 from nsm.surfaces.validation import CleanMesh
+from nsm.wording import number_of
 
 _KEY = "surface.parameterization"
 _ON_BOUNDARY = 1e-5  # single precision of a file
@@ -89,7 +90,7 @@ def islands_as_given(
     cut_faces, old = topology.cut_along(mesh.faces, np.isin(edges.pairs @ [base, 1], seams))
     flat = np.empty((len(old), 2))
     flat[cut_faces] = own
-    log = f"cut along {len(np.unique(seams))} edges, as the texture coordinates are"
+    log = f"cut along {number_of(len(np.unique(seams)), 'edge')}, as the texture coordinates are"
     label = topology.face_components(cut_faces)
     islands = []
     for k in np.argsort(-np.bincount(label), kind="stable").tolist():
@@ -104,7 +105,10 @@ def islands_as_given(
         if not topology.is_disc(part):
             laid, part, inner, holes, cuts = _opened(laid, part, name)
             origin = origin[inner]
-            lines.append(f"{holes} holes in the texture coordinates, cut open along {cuts} edges")
+            lines.append(
+                f"{number_of(holes, 'hole')} in the texture coordinates, cut open along "
+                f"{number_of(cuts, 'edge')}"
+            )
         _check(laid, part, name)
         both, part, inserted = split_chords(np.hstack([mesh.vertices[origin], laid]), part)
         origin = np.concatenate([origin, np.full(inserted, -1)])
@@ -128,7 +132,7 @@ def _at_corners(mesh: CleanMesh, faces: np.ndarray, uv: np.ndarray, name: str) -
     file_face, own_face = topology.equal_faces(there, here)
     if len(own_face) < len(here):
         lost = len(here) - len(own_face)
-        raise _unusable(name, f"of {lost} faces are lost by the repair; take slim")
+        raise _unusable(name, f"of {number_of(lost, 'face')} are lost by the repair; take slim")
     order = np.empty(len(here), dtype=np.int64)
     order[own_face] = file_face
     corner = (here[:, :, None] == there[order][:, None, :]).argmax(axis=2)
@@ -143,7 +147,7 @@ def _check(flat: np.ndarray, faces: np.ndarray, name: str) -> None:
         raise _unusable(name, reason)
     crossings = boundary_self_intersections(flat, topology.boundary_loops(faces)[0])
     if crossings:
-        reason = f"overlap: their border crosses itself {crossings} times; take slim"
+        reason = f"overlap: their border crosses itself {number_of(crossings, 'time')}; take slim"
         raise _unusable(name, reason)
 
 

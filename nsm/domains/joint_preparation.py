@@ -26,8 +26,9 @@ from nsm.stages import at, counted
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import Cut
-from nsm.surfaces.landmarks import MISSING
+from nsm.surfaces.landmarks import MISSING, kept_landmarks
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
+from nsm.wording import number_of
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,9 @@ def prepare_jointly(
             key="surface.parameterization",
         )
     cleaned = [m.cleaned(repairs) for m in meshes]
-    found = [_kept(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)]
+    found = [
+        kept_landmarks(c, ids, m.name) for c, ids, m in zip(cleaned, landmarks, meshes, strict=True)
+    ]
     everywhere: np.ndarray = np.all(np.stack(found) >= 0, axis=0)
     common_ids = [ids[everywhere] for ids in found]
     enough = everywhere.sum() >= 2 if domain.has_boundary else len(distinct(common_ids)) >= 4
@@ -232,26 +235,14 @@ def check_common_topology(
                     key=name,
                 )
             raise NsmError(
-                f"{name} has genus {genus} and {loops} boundary loops, {names[0]} genus "
-                f"{found[0][0]} and {found[0][1]}: a map between them would tear; fill holes, as "
-                "surface.fill_holes=true does with small ones, or remove handles until they agree",
+                f"{name} has genus {genus} and {number_of(loops, 'boundary loop')}, "
+                f"{names[0]} genus {found[0][0]} and {found[0][1]}: a map between them would tear; "
+                "fill holes, as surface.fill_holes=true does with small ones, or remove handles "
+                "until they agree",
                 kind="wrong_topology",
                 key=name,
             )
     return found[0]
-
-
-def _kept(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
-    """Landmarks as vertices of the cleaned mesh; -1 for those that it lacks."""
-    kept = np.where(landmarks >= 0, mesh.merged[landmarks], MISSING)
-    for given, vertex in zip(landmarks, kept, strict=True):
-        if vertex < 0 <= given:
-            raise NsmError(
-                f"{name}: landmark {given} is not on the surface; give another vertex",
-                kind="not_on_surface",
-                key=name,
-            )
-    return kept
 
 
 def _cut_alike(
@@ -282,7 +273,8 @@ def _cut_alike(
         best = best_common_cut(*what)
     fractions = common_fractions(best.cuts, best.keys, bounded(domain))
     line = (
-        f"seam led along {best.seam} paths through {best.count} of {len(common[0])} landmarks, "
+        f"seam led along {best.seam} paths through {best.count} of "
+        f"{number_of(len(common[0]), 'landmark')}, "
         "the same on all meshes"
     )
 

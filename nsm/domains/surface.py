@@ -32,6 +32,7 @@ from nsm.surfaces.landmarks import listed
 from nsm.surfaces.loading import as_arrays
 from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
+from nsm.wording import number_of
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 OPTIONAL = ("lattice", "ends", "caps", "given_uv")
@@ -270,9 +271,11 @@ class Surface:
         flipped = flipped_triangles(flat.uv, cut.faces)
         crossings = boundary_self_intersections(flat.uv, cut.loop) if domain.has_boundary else 0
         if flipped or crossings:
+            faults = f"{number_of(flipped, 'flipped triangle')}, "
+            faults += number_of(crossings, "boundary crossing")
             raise NsmError(
-                f"{name}: the parameterization is not injective ({flipped} flipped triangles, "
-                f"{crossings} boundary crossings); give seam_vertices at the tips of long parts",
+                f"{name}: the parameterization is not injective ({faults}); give "
+                "seam_vertices at the tips of long parts",
                 kind="not_injective",
                 key=name,
             )

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from nsm.domains.planar_mesh import cross, flipped, signed_areas
 from nsm.stages import counted
 from nsm.surfaces import topology
+from nsm.wording import number_of
 
 _RINGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _ROUNDS, _ITERATIONS = 20, 100
@@ -98,7 +99,8 @@ def untangled(
             near[joined[near[joined].any(axis=1)]] = True
         free = near & ~held
         patches = _patches(joined, free, bad)
-        for patch in counted(f"{int(bad.sum())} flips, {rings} rings around each", patches):
+        step = f"{number_of(int(bad.sum()), 'flip')}, {number_of(rings, 'ring')} around each"
+        for patch in counted(step, patches):
             if work > 0:
                 work -= _solve(rest, faces[patch], image, free, copies, work)
         if near[joined].all():

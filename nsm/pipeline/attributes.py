@@ -12,6 +12,7 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.results import SurfaceMap, atomic_write
 from nsm.results.points import as_values
+from nsm.wording import number_of
 
 
 def read_attributes(settings: dict[str, Any], rows: Sequence[int]) -> dict[str, np.ndarray]:
@@ -40,7 +41,7 @@ def read_attributes(settings: dict[str, Any], rows: Sequence[int]) -> dict[str, 
             as_values(values, "its values")
             if values.ndim == 0 or len(values) < count:
                 given = values.shape[0] if values.ndim else 0
-                raise ValueError(f"the mesh has {count} vertices, but {given} rows are in it")
+                raise ValueError(f"{number_of(given, 'row')}, but the mesh has {count} vertices")
         except (OSError, ValueError, EOFError, OverflowError, SyntaxError, NsmError) as error:
             reason = " ".join(str(error).split())[:160]
             raise NsmError(

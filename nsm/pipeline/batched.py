@@ -41,6 +41,7 @@ from nsm.sweeps import is_complete
 from nsm.tasks import Overfit, OverfitEnsemble
 from nsm.tasks.ensemble import EnsembleSplit
 from nsm.tasks.joint_optimizer import shared_options
+from nsm.wording import number_of
 
 Call = tuple[dict[str, Any], str, str]  # settings, folder and cwd, as for run_job
 Ended = tuple[int, "str | None"]  # number of a job, and why it failed
@@ -263,7 +264,9 @@ def _train(jobs: list[_Job], console: Console, started: float) -> Iterator[Ended
             # whatever it is, the job that it concerns will report it again
             reason = " ".join(str(fault).split())[:200]
             which = fault.which if isinstance(fault, EnsembleSplit) else range(len(jobs))
-            console.print(f"{reason}; {len(which)} of {len(jobs)} jobs go on alone")
+            console.print(
+                f"{reason}; going on alone: {len(which)} of {number_of(len(jobs), 'job')}"
+            )
             yield from (jobs[i].alone() for i in which)
             # the others may have checkpoints by now
             jobs = [_resuming(job) for i, job in enumerate(jobs) if i not in which]

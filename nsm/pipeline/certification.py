@@ -15,6 +15,7 @@ from nsm.results.certificate import verdict
 from nsm.results.divergence_guard import DivergenceGuard
 from nsm.results.progress import TrainingProgress
 from nsm.settings import PRECISIONS
+from nsm.wording import number_of
 
 _SHARE = 10  # a further training has this part of the training's steps
 _OVERLAPS = "boundary_self_intersections"  # of a free boundary
@@ -40,7 +41,7 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
     """
     settings, say = task.config.certification, task.console.print
     task.trained = best = result = task.make_result(module)
-    before = result.certificate
+    before, what = result.certificate, getattr(result, "statement", "injective")
     rounds = 0
     least = math.inf
     while settings.repair and not best.certificate["certified"]:
@@ -49,13 +50,15 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
         if not _trainable(best) or rounds >= settings.rounds:
             break
         if _faults(best) >= least:
-            say(f"{verdict(best.certificate)}, as before: no further training", soft_wrap=True)
+            said = verdict(best.certificate, what)
+            say(f"{said}, as before: no further training", soft_wrap=True)
             break
         least = _faults(best)
         rounds += 1
         say(
-            f"{verdict(best.certificate)}; going on with stronger terms, "
-            f"{rounds} of {settings.rounds} times at most"
+            f"{verdict(best.certificate, what)}; going on with stronger terms, "
+            f"{rounds} of {number_of(settings.rounds, 'time')} at most",
+            soft_wrap=True,
         )
         try:
             _train_on(task, module, data)
@@ -64,7 +67,7 @@ def certified(task: Task, module: Any, data: pl.LightningDataModule) -> tuple[An
             break
         result = task.make_result(module)
         best = min(best, result, key=_faults)
-    after, what = best.certificate, getattr(best, "statement", "injective")
+    after = best.certificate
     earlier = "" if before["certified"] else f"; before repair: {verdict(before, what)}"
     say(verdict(after, what) + earlier, soft_wrap=True)
     if after.get(_OVERLAPS):

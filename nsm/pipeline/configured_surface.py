@@ -12,6 +12,7 @@ from rich.console import Console
 from nsm.domains import Surface, domain
 from nsm.stages import stage
 from nsm.surfaces.validation import Repairs
+from nsm.wording import number_of
 
 
 def keep_absolute(config: DictConfig) -> None:
@@ -63,7 +64,8 @@ def configured_surface(config: DictConfig, console: Console, given: Any = None) 
 def report_surface(console: Console, surface: Surface) -> None:
     """Print what a prepared surface is, and how its mesh was changed."""
     console.print(
-        f"{surface.name}: {len(surface.vertices)} vertices, {len(surface.faces)} faces on the "
+        f"{surface.name}: {len(surface.vertices)} vertices, "
+        f"{number_of(len(surface.faces), 'face')} on the "
         f"{surface.domain}, median symmetric Dirichlet "
         f"{surface.quality['median_symmetric_dirichlet']:.2f}",
         soft_wrap=True,

@@ -31,6 +31,7 @@ from nsm.surfaces.landmarks import (
     listed,
     present,
 )
+from nsm.wording import number_of
 
 _MOVED = 1e-4  # percent of the diagonal: less is the rounding of a file's digits
 
@@ -136,7 +137,8 @@ def all_landmarks(given: Any, surfaces: Sequence[str]) -> tuple[list[Landmarks],
     check_equal_lengths(surfaces, lists)
     if labels is not None and len(labels) != len(lists[0]):
         raise NsmError(
-            f"{given}: {len(labels)} names for {len(lists[0])} landmarks; give one for each",
+            f"{given}: {number_of(len(labels), 'name')} for "
+            f"{number_of(len(lists[0]), 'landmark')}; give one for each",
             kind="different_lengths",
             key="landmarks",
         )
@@ -191,7 +193,7 @@ def _lists(given: Any, surfaces: Sequence[str]) -> tuple[list[Any], list[str] | 
         return [[] for _ in range(count)], None
     if len(lists) != count:
         raise NsmError(
-            f"landmarks: {len(lists)} lists for {count} surfaces; give one for each",
+            f"landmarks: {number_of(len(lists), 'list')} for {count} surfaces; give one for each",
             kind="out_of_range",
             key="landmarks",
         )

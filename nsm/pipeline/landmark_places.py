@@ -14,6 +14,7 @@ from nsm.pipeline.landmark_inputs import landmark_lists, name_of
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.inserted_points import with_points
 from nsm.surfaces.landmarks import MISSING, check_places, present
+from nsm.wording import number_of
 
 
 def with_places(
@@ -50,8 +51,9 @@ def with_places(
             result[k], places = replace(shape, vertices=vertices, faces=faces), given
             if len(vertices) > count:
                 console.print(
-                    f"{shape.name}: {len(vertices) - count} landmarks inside triangles become "
-                    f"vertices, numbers {count} to {len(vertices) - 1}",
+                    f"{shape.name}: landmarks inside triangles become "
+                    f"{number_of(len(vertices) - count, 'vertex')}, "
+                    f"numbers {count} to {len(vertices) - 1}",
                     highlight=False,
                     soft_wrap=True,
                 )

@@ -21,6 +21,7 @@ from nsm.maps import AnalyticSurface
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.surfaces.topology import boundary_loops, face_areas, genus_and_boundary
 from nsm.surfaces.validation import Repairs
+from nsm.wording import number_of
 
 _NEAREST = 3  # landmarks to which distances are compared: long ways may lead around what is missing
 _FEWEST = 3  # landmarks that tell the scale
@@ -90,8 +91,8 @@ def closed_parts(
     if marks.shape[1] < _CONES:
         console.print(
             Text(
-                f"WARNING: {marks.shape[1]} landmarks do not say where a part belongs; give "
-                f"{_CONES} or more",
+                f"WARNING: {number_of(marks.shape[1], 'landmark')} cannot say where a part "
+                f"belongs; give {_CONES} or more",
                 style="yellow",
             ),
             soft_wrap=True,

@@ -16,13 +16,15 @@ from nsm.domains import DOMAINS, Domain
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.configured_surface import configured_repairs
-from nsm.pipeline.landmark_inputs import landmark_vertices
+from nsm.pipeline.landmark_inputs import landmark_vertices, name_of
 from nsm.pipeline.landmark_places import as_places, with_places
 from nsm.pipeline.resolve_inputs import Shape
 from nsm.stages import stage
 from nsm.surfaces.landmark_files import to_json
+from nsm.surfaces.landmarks import kept_landmarks
 from nsm.surfaces.topology import boundary_loops
 from nsm.surfaces.validation import CleanMesh
+from nsm.wording import number_of
 
 AUTO = "auto"
 _ENOUGH = 4  # landmarks for common cones, completed only by sure ones
@@ -175,19 +177,22 @@ def given_or_proposed(
     meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
     told = exact and not none
     ids = landmark_vertices(landmarks, shapes, console, template=template, told=told)
+    repairs = configured_repairs(config)
+    if len(ids[0]):
+        with stage(console, f"landmarks of {', '.join(name_of(shape) for shape in shapes)}"):
+            for shape, own in zip(shapes, ids, strict=True):
+                if isinstance(shape, Mesh):
+                    kept_landmarks(shape.cleaned(repairs), own, shape.name)
     some_lack = any((of_one < 0).any() for of_one in ids)
     few = settings.complete and 1 <= len(ids[0]) <= _COMPLETED and not some_lack
     possible = len(meshes) == len(shapes) and domain == DOMAINS["orbifold"]
     if not (asked or (possible and (none or few))):
         return list(shapes), ids, None
-    repairs = configured_repairs(config)
     what = "landmarks" if none else "further landmarks"
     with stage(console, f"proposing {what} of {', '.join(mesh.name for mesh in meshes)}"):
         cleaned = [mesh.cleaned(repairs) for mesh in meshes]
         if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
             return list(shapes), ids, None
-        if any((mesh.merged[of_one] < 0).any() for mesh, of_one in zip(cleaned, ids, strict=True)):
-            return list(shapes), ids, None  # refused where the meshes are prepared
         try:
             found = _proposal(cleaned, ids, settings.alternative)
         except NsmError as error:
@@ -235,8 +240,8 @@ def _proposal(
         rows, scores, margin, sure = every.vertices, every.scores, every.margin, every.sure
     if alternative >= len(rows):
         raise NsmError(
-            f"proposal.alternative={alternative}: there are {len(rows)} proposals; give a number "
-            f"from 0 to {len(rows) - 1}",
+            f"proposal.alternative={alternative}: of {number_of(len(rows), 'proposal')}; give a "
+            f"number from 0 to {len(rows) - 1}",
             kind="out_of_range",
             key="proposal.alternative",
         )

@@ -196,7 +196,8 @@ def neural_surfaces(
         for surface in prepared:
             report_surface(console, surface)
         laid_out = dict(zip(meshes, prepared, strict=True))
-        shown([laid_out.get(k) or ready[k].surface for k in range(len(shapes))])
+        with stage(console, f"picture of {', '.join(surface.name for surface in prepared)}"):
+            shown([laid_out.get(k) or ready[k].surface for k in range(len(shapes))])
         ready.update(zip(meshes, cached_surfaces(prepared, config, console), strict=True))
     else:
         shown([ready[k].surface for k in range(len(shapes))])

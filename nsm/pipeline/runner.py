@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -150,14 +151,16 @@ def run_parts(task: Task, parts: list[Task], run: Run, started: float) -> Any:
         begun = time.monotonic()
         own = Run(part.config, run.folder / f"part_{k}", resuming=run.resuming, inner=True)
         results.append(run_prepared(part, own, begun))
-        steps += part.config.trainer.max_steps
+        stored = json.loads((own.folder / "metrics.json").read_text(encoding="utf-8"))
+        steps += stored["steps"]
     result = task.joined(results)
     task.measure(result)
     task.save(run.folder, result)
     warnings = task.warnings(result)
     _print_figures(task, run, result, warnings, time.monotonic() - started)
     if task.config.artefacts:
-        task.write_artefacts(run.folder, result)
+        with stage(task.console, f"{task.title}: pictures and meshes"):
+            task.write_artefacts(run.folder, result)
     summary = {
         "surface": task.surface.name,
         "steps": steps,

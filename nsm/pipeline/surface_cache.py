@@ -108,15 +108,17 @@ def cached_surfaces(
     Raises:
         NsmError: settings in ``phi.overrides`` that cannot be used.
     """
-    overfit = _overfit_config(config, surfaces[0].domain)
-    settings = plain(overfit)
-    if not _cacheable(settings):
+    with stage(console, f"neural surfaces of {', '.join(surface.name for surface in surfaces)}"):
+        overfit = _overfit_config(config, surfaces[0].domain)
+        settings = plain(overfit)
+        kept = _cacheable(settings)
+        folders = {_folder_of(one, settings): one for one in surfaces} if kept else {}
+    if not kept:
         with temporary_folder() as folder:
             return [
                 _made(surface, overfit, Path(folder) / str(k), console)
                 for k, surface in enumerate(surfaces)
             ]
-    folders = {_folder_of(surface, settings): surface for surface in surfaces}
     missing = {f: surface for f, surface in folders.items() if not is_complete(f)}
     if len(missing) > 1 and accelerator_of(overfit) == "gpu":
         # those on closed domains, for instance, cannot be trained together

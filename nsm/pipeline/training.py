@@ -26,6 +26,7 @@ from nsm.pipeline.process_state import matmul_precision, quiet_lightning
 from nsm.pipeline.processes import Process, raised_by, shared_steps, take_over
 from nsm.results import atomic_write
 from nsm.results.callbacks import AtomicCheckpoint, GradientWatch, Pictures
+from nsm.results.devices import NO_GPU, count_of_gpus
 from nsm.results.divergence_guard import DivergenceGuard
 from nsm.results.evolution import EvolutionStrip
 from nsm.results.loggers import Distributed, build_loggers, close
@@ -35,6 +36,7 @@ from nsm.run_directories import is_temporary
 from nsm.settings import PRECISIONS
 from nsm.tasks.compiling import Compiled
 from nsm.tasks.ensemble import Ensemble
+from nsm.wording import number_of
 
 CONFIG_FILE = "config.yaml"
 
@@ -277,14 +279,11 @@ def check_device(config: DictConfig) -> None:
     """
     if accelerator_of(config) != "gpu" or MPSAccelerator.is_available():
         return
-    count = CUDAAccelerator.auto_device_count()
+    count = count_of_gpus()
     if count < config.trainer.devices:
-        if count:
-            reason = f"there are {count} GPUs; give trainer.devices={count} or fewer"
-        else:
-            reason = "torch finds no GPU; give device=cpu, or install a driver and torch for it"
+        some = f"torch finds {number_of(count, 'GPU')}; give trainer.devices={count} or fewer"
         raise NsmError(
-            f"device=cuda (trainer.accelerator=gpu): {reason}",
+            f"device=cuda (trainer.accelerator=gpu): {some if count else NO_GPU}",
             kind="no_such_device",
             key="trainer.accelerator",
         )

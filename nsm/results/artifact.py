@@ -17,6 +17,7 @@ from nsm.domains.surface import ARRAYS, OPTIONAL
 from nsm.energies import spectrum
 from nsm.errors import NsmError
 from nsm.maps import Placed
+from nsm.results.devices import as_device
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.metrics import evaluate, evaluate_jacobian
 from nsm.results.networks import network_of
@@ -108,8 +109,12 @@ class NeuralSurface:
         return copy.deepcopy(self._placed)
 
     def to(self, device: torch.device | str) -> NeuralSurface:
-        """The same surface with its network on a device."""
-        return replace(self, map=copy.deepcopy(self.map).to(device))
+        """The same surface with its network on a device.
+
+        Raises:
+            NsmError: as :func:`nsm.results.devices.as_device`.
+        """
+        return replace(self, map=copy.deepcopy(self.map).to(as_device(device)))
 
     @property
     def _placed(self) -> Placed:

@@ -19,8 +19,16 @@ from nsm.domains import Domain
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped
 from nsm.domains.untangling import untangled
 from nsm.surfaces.topology import boundary_loops
+from nsm.wording import number_of
 
 INTO = "injective into the target"  # of a part of a shape
+# what certificates count, one of each in words
+_COUNTED = {
+    "flipped_triangles": "flipped triangle",
+    "torn_vertices": "torn vertex",
+    "boundary_self_intersections": "boundary self intersection",
+    "boundary_order_violations": "boundary order violation",
+}
 
 
 def certificate(
@@ -80,7 +88,11 @@ def statement(domain: Domain | None, seam: bool = False) -> str:
 
 def verdict(found: dict[str, Any], what: str = "injective") -> str:
     """A certificate in one line; ``what`` it says of the map, as :func:`statement` words it."""
-    counts = [f"{n} {name.replace('_', ' ')}" for name, n in found.items() if name != "certified"]
+    counts = [
+        number_of(n, _COUNTED[name]) if name in _COUNTED else f"{n} {name.replace('_', ' ')}"
+        for name, n in found.items()
+        if name != "certified"
+    ]
     start = f"certified {what}" if found["certified"] else f"NOT certified {what}"
     return f"{start}: {', '.join(counts)}"
 

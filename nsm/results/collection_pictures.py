@@ -29,6 +29,7 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
     every = {key for figures in collection.metrics["pairs"].values() for key in figures}
     shown = {key: title for key, title in _SHOWN.items() if key in every}
     figure = Figure(figsize=((side + 0.2) * len(shown), side), dpi=120)
+    figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.15)  # inches
     for n, (key, title) in enumerate(shown.items()):
         values = np.full((k, k), np.nan)
         for i in range(k):
@@ -47,7 +48,7 @@ def figures_picture(path: str | Path, collection: SurfaceCollection) -> None:
         axes.set_xticks(range(k), names, rotation=30, ha="right")
         axes.set_yticks(range(k), names)
         axes.set_title(title)
-    figure.tight_layout()
+        axes.set(xlabel="target", ylabel="source")
     save_figure(figure, path)
 
 

@@ -96,7 +96,7 @@ class ComposedMap:
         return MapSequence(*(f.module() for f in self.maps))
 
     def to(self, device: torch.device | str) -> ComposedMap:
-        """The same map with its networks on a device."""
+        """As :meth:`SurfaceMap.to`."""
         return ComposedMap(tuple(f.to(device) for f in self.maps))
 
     def correspondences(self, *, back: bool = False) -> Places:

@@ -40,8 +40,8 @@ def landmarks_picture(
 
 
 def _drawn(surface: Surface, ids: np.ndarray) -> np.ndarray:
-    """A surface with spheres at landmarks (L,)."""
+    """A surface with spheres at landmarks (L,), of one colour on all surfaces."""
     vertices = surface.vertices
-    spheres = Spheres(vertices, surface.faces, surface.cut_vertex[ids[ids >= 0]])
+    spheres = Spheres(vertices, surface.faces, np.where(ids >= 0, surface.cut_vertex[ids], -1))
     paint = spheres.painted(lambda blend: np.full((len(blend(vertices)), 3), _GREY))
     return View(vertices, PANEL).draw(*spheres.mesh, paint, surface.seam_pairs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -13,6 +13,7 @@ from nsm.domains import Surface
 from nsm.errors import NsmError
 from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
+from nsm.results.glb import as_glb
 from nsm.results.textures import checkerboard, checkerboard_at
 from nsm.results.vertex_values import mean_by_file_vertex
 
@@ -49,10 +50,11 @@ def export_mesh(
     """Write a mesh (V, 3), (F, 3) with its coordinates uv (V, 2) in Ω.
 
     A closed surface without a seam has no coordinates that are continuous on it: it goes without
-    (None), and a GLB file may have colours (V, 3) in [0, 1] at the vertices instead of a texture.
-    Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file contains the
-    texture; beside an OBJ file go a material file and a PNG. In an OBJ file the triangles' corners
-    may have rows of uv of their own, corners (F, 3), instead of those of their vertices.
+    (None), and a GLB file may have colours (V, 3) in sRGB, [0, 1], at the vertices instead of a
+    texture. Texture coordinates are (uv + 1) / 2, so that Ω lies within [0, 1]². A GLB file
+    contains the texture; beside an OBJ file go a material file and a PNG. In an OBJ file the
+    triangles' corners may have rows of uv of their own, corners (F, 3), instead of those of their
+    vertices.
 
     Raises:
         NsmError: ``unknown_format``: the file's ending is neither .obj nor .glb.
@@ -60,7 +62,8 @@ def export_mesh(
     target = Path(path)
     coordinates = None if uv is None else 0.5 * (np.asarray(uv) + 1)
     if target.suffix.lower() == ".glb":
-        atomic_write(target, _glb(vertices, faces, coordinates, texture, colours))
+        glb = as_glb(vertices, faces, uv=coordinates, image=texture, colours=colours)
+        atomic_write(target, glb)
         return
     if target.suffix.lower() != ".obj":
         message = f"{target}: meshes are written as .obj or .glb"
@@ -124,24 +127,3 @@ def export_surface(
     faces, corners = faces_of_file(surface)
     points = mean_by_file_vertex(surface, vertices)
     export_mesh(path, points, faces, uv if bounded else None, corners=corners)
-
-
-def _glb(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    coordinates: np.ndarray | None,
-    texture: Image.Image | None,
-    colours: np.ndarray | None,
-) -> bytes:
-    import trimesh
-
-    visual: Any = None
-    if coordinates is not None:
-        visual = trimesh.visual.TextureVisuals(uv=coordinates, image=texture)
-    elif colours is not None:
-        # as bytes: trimesh would take other numbers for what they are
-        visual = trimesh.visual.ColorVisuals(vertex_colors=np.rint(255 * colours).astype(np.uint8))
-    mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
-    data = trimesh.Scene(mesh).export(file_type="glb")
-    assert isinstance(data, bytes)
-    return data

@@ -12,12 +12,12 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.results.file_faces import faces_of_file
 from nsm.results.files import atomic_write
+from nsm.results.glb import FACES, VERTICES
 
 if TYPE_CHECKING:
     from nsm.results.surface_map import SurfaceMap
 
 _FLOAT, _UNSIGNED = 5126, 5125  # component types
-_VERTICES, _FACES = 34962, 34963  # what a view of the buffer is for
 _SECONDS = (0.0, 2.0, 4.0)
 _WEIGHTS = (0.0, 1.0, 0.0)
 
@@ -64,9 +64,9 @@ def write_morph_target(
         message = f"{target}: lengths exceed single precision; scale the meshes"
         raise NsmError(message, kind="out_of_range", key=str(target))
     buffer = _Buffer()
-    position = buffer.add(start, "VEC3", _VERTICES, bounds=True)
-    moved = buffer.add(change, "VEC3", _VERTICES, bounds=True)
-    corners = buffer.add(faces.astype("<u4").ravel(), "SCALAR", _FACES)
+    position = buffer.add(start, "VEC3", VERTICES, bounds=True)
+    moved = buffer.add(change, "VEC3", VERTICES, bounds=True)
+    corners = buffer.add(faces.astype("<u4").ravel(), "SCALAR", FACES)
     times = buffer.add(np.array(_SECONDS, "<f4"), "SCALAR", bounds=True)
     weights = buffer.add(np.array(_WEIGHTS, "<f4"), "SCALAR")
     primitive = {

@@ -66,17 +66,38 @@ class Parameterization:
         on triangles. Values are in the units of :attr:`uv`. Its weights are a copy, frozen:
         ``module().requires_grad_(True)`` trains them, and leaves this map as it is.
         """
-        return copy.deepcopy(Placed(self.map, 1.0, torch.zeros(2)))
+        return copy.deepcopy(Placed(self.map, 1 / self._size, torch.zeros(2)))
 
     @cached_property
     def uv(self) -> np.ndarray:
-        """The new coordinates (V, 2) of the cut mesh's vertices, in its normalised units."""
+        """The new coordinates (V, 2) of the cut mesh's vertices, in its normalised units.
+
+        An energy that does not see the scale, such as ``conformal``, leaves it to chance: the area
+        is that of the surface then.
+        """
+        return self._laid * self._size
+
+    @cached_property
+    def _laid(self) -> np.ndarray:
+        """The coordinates (V, 2) as h gives them, with the correction."""
         return self.correction.of(evaluate(self.map, self.phi.surface.uv))
+
+    @cached_property
+    def _size(self) -> float:
+        """The factor from h to the new coordinates."""
+        target = str(self.config.get("energy", {}).get("_target_", ""))
+        known = getattr(nsm.energies, target.rpartition(".")[2], None)
+        ours = target.startswith("nsm.energies.") and getattr(known, "scale_free", False)
+        if not ours or self._target is not None:
+            return 1.0
+        s = self.phi.surface
+        area = face_areas(s.vertices, s.faces).sum()
+        return float(np.sqrt(area / np.abs(signed_areas(self._laid, s.faces)).sum()))
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
         """Whether the new coordinates are injective (see :func:`certificate`)."""
-        return certificate(self._target, self.uv, self.phi.surface.faces)
+        return certificate(self._target, self._laid, self.phi.surface.faces)
 
     @property
     def _target(self) -> Domain | None:
@@ -87,8 +108,8 @@ class Parameterization:
         """The map with its flipped triangles turned back, where possible."""
         surface = self.phi.surface
         nothing = np.zeros(len(surface.uv), dtype=bool)
-        better = repaired(self._target, surface.uv, surface.faces, self.uv, nothing)
-        return replace(self, correction=Correction.between(self.uv, better, self.correction))
+        better = repaired(self._target, surface.uv, surface.faces, self._laid, nothing)
+        return replace(self, correction=Correction.between(self._laid, better, self.correction))
 
     def save(self, folder: str | Path) -> None:
         """Write the surface and the map into a folder.
@@ -121,15 +142,5 @@ def load_parameterization(folder: str | Path, trust: Iterable[str] = ()) -> Para
 
 
 def in_file_units(flat: Parameterization) -> np.ndarray:
-    """The new coordinates (V, 2) in the units of the mesh file.
-
-    An energy that does not see the scale leaves it to chance: the surface's area is kept then.
-    """
-    surface = flat.phi.surface
-    target = str(flat.config.get("energy", {}).get("_target_", ""))
-    known = getattr(nsm.energies, target.rpartition(".")[2], None)
-    factor = 1.0
-    if target.startswith("nsm.energies.") and getattr(known, "scale_free", False):
-        area = face_areas(surface.vertices, surface.faces).sum()
-        factor = float(np.sqrt(area / np.abs(signed_areas(flat.uv, surface.faces)).sum()))
-    return flat.uv * factor / surface.scale
+    """The new coordinates (V, 2) in the units of the mesh file."""
+    return flat.uv / flat.phi.surface.scale

@@ -35,8 +35,15 @@ class ParameterizationAtlas:
 
     @property
     def metrics(self) -> dict[str, dict[str, float]]:
-        """The figures of each chart, by its name."""
-        return {chart.phi.surface.name: chart.metrics["nsm"] for chart in self.charts}
+        """The figures of each chart, by its name; before them those of the texture coordinates that
+        it started from, if it did, as ``NAME, given UV``."""
+        found = {}
+        for chart in self.charts:
+            name = chart.phi.surface.name
+            if "given" in chart.metrics:
+                found[f"{name}, given UV"] = chart.metrics["given"]
+            found[name] = chart.metrics["nsm"]
+        return found
 
     @property
     def config(self) -> dict[str, Any]:

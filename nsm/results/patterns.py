@@ -46,7 +46,7 @@ def round_length(most: float) -> float:
 
 
 def _label(bar: float) -> str:
-    return f"{bar:g} units"
+    return f"{bar:g} unit" if bar == 1 else f"{bar:g} units"
 
 
 def _svg(outlines: list[np.ndarray], extent: np.ndarray, bar: float) -> bytes:

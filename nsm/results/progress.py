@@ -56,6 +56,7 @@ class TrainingProgress(Callback):
         if not self.console.is_terminal or showing():
             self.within = ExitStack()
             self.within.enter_context(stage(self.console, self.title))
+            at("step", trainer.global_step, trainer.max_steps)
             return
         self.bar = Progress(
             TextColumn("{task.description}"),

@@ -18,7 +18,7 @@ class Spheres:
 
     Args:
         vertices, faces: the mesh (V, 3), (F, 3).
-        at: (L,) vertices; each sphere has a colour of its own, the same for the same number.
+        at: (L,) vertices, -1 for none; each sphere has a colour of its own, by its number and L.
 
     Attributes:
         mesh: vertices and faces of the mesh and, behind them, of the spheres.
@@ -27,11 +27,12 @@ class Spheres:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, at: np.ndarray) -> None:
         ball, triangles = sphere(2)
         radius = _RADIUS * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-        first = len(vertices) + len(ball) * np.arange(len(at))
-        every = (vertices[at][:, None] + radius * ball).reshape(-1, 3)
+        (there,) = np.nonzero(at >= 0)
+        first = len(vertices) + len(ball) * np.arange(len(there))
+        every = (vertices[at[there]][:, None] + radius * ball).reshape(-1, 3)
         more = (triangles[None] + first[:, None, None]).reshape(-1, 3)
         self.mesh = np.concatenate([vertices, every]), np.concatenate([faces, more])
-        colours = colormaps["hsv"](np.arange(len(at)) / max(1, len(at)))[:, :3]
+        colours = colormaps["hsv"](there / max(1, len(at)))[:, :3]
         self._colours = np.zeros((len(vertices) + len(every), 4))
         self._colours[len(vertices) :, :3] = np.repeat(colours, len(ball), axis=0)
         self._colours[len(vertices) :, 3] = 1

@@ -20,6 +20,7 @@ from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface, save_surface
 from nsm.results.certificate import INTO, Correction, certificate, repaired, statement
 from nsm.results.composed_map import ComposedMap, composed, correspondence_matrix, transferred
+from nsm.results.devices import as_device
 from nsm.results.file_faces import FileFaces
 from nsm.results.files import write_pair
 from nsm.results.metrics import evaluate
@@ -148,7 +149,12 @@ class SurfaceMap:
         return SurfaceMapModule(self)
 
     def to(self, device: torch.device | str) -> SurfaceMap:
-        """The same map with its networks on a device."""
+        """The same map with its networks on a device.
+
+        Raises:
+            NsmError: as :func:`nsm.results.devices.as_device`.
+        """
+        device = as_device(device)
         return replace(
             self,
             source=self.source.to(device),

@@ -6,7 +6,7 @@ import io
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -15,6 +15,7 @@ from nsm.errors import NsmError
 from nsm.results.baking import atlas_fault, baked, padded
 from nsm.results.file_faces import FileFaces
 from nsm.results.files import atomic_write
+from nsm.results.glb import as_glb
 from nsm.surfaces.atlas import unwrapped
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.loading import is_mesh_path, load_mesh
@@ -116,24 +117,16 @@ class TexturedMesh:
         atomic_write(target, "".join(lines).encode())
 
     def _write_glb(self, target: Path) -> None:
-        import trimesh
-
         uv, number = self._corners()
         pairs = np.stack([self.faces, number], axis=2).reshape(-1, 2)
         split, corner = np.unique(pairs, axis=0, return_inverse=True)
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=Image.fromarray(self.image),
-            metallicFactor=0.0,
-            roughnessFactor=1.0,
-            alphaMode="BLEND" if self.image.shape[2] == 4 else None,
+        glb = as_glb(
+            self.vertices[split[:, 0]],
+            corner.reshape(-1, 3),
+            uv=uv[split[:, 1]],
+            image=Image.fromarray(self.image),
         )
-        visual: Any = trimesh.visual.TextureVisuals(uv=uv[split[:, 1]], material=material)
-        mesh = trimesh.Trimesh(
-            self.vertices[split[:, 0]], corner.reshape(-1, 3), visual=visual, process=False
-        )
-        data = trimesh.Scene(mesh).export(file_type="glb")
-        assert isinstance(data, bytes)
-        atomic_write(target, data)
+        atomic_write(target, glb)
 
 
 def painted_by(

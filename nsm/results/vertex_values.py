@@ -6,6 +6,7 @@ import numpy as np
 
 from nsm.domains import Surface
 from nsm.errors import NsmError
+from nsm.wording import number_of
 
 
 def by_file_vertex(surface: Surface, values: np.ndarray) -> np.ndarray:
@@ -41,5 +42,5 @@ def check_rows(surface: Surface, values: np.ndarray) -> None:
     needed = len(surface.cut_vertex)
     if values.ndim == 0 or len(values) != needed:
         rows = 0 if values.ndim == 0 else len(values)
-        message = f"{surface.name} has {needed} vertices, but {rows} rows were given"
+        message = f"{surface.name} has {needed} vertices; given: {number_of(rows, 'row')}"
         raise NsmError(message, kind="wrong_shape", key=surface.name)

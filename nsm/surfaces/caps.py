@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from nsm.surfaces import topology
+from nsm.wording import number_of
 
 _TRIANGLES = 3000  # of a large cap, about
 _GROWTH = 1.3  # of the edges from ring to ring
@@ -55,10 +56,9 @@ def capped(
     areas = topology.face_areas(whole, every)
     percent = 100 * float(areas[len(faces) :].sum() / areas.sum())
     sizes = ", ".join(str(len(loop)) for loop in loops[:8]) + (", ..." if len(loops) > 8 else "")
-    what = "boundaries" if len(loops) > 1 else "boundary"
     line = (
-        f"{len(loops)} {what} of {sizes} edges closed by caps for the map, which have "
-        f"{percent:.0f} % of the area; left out of figures and exported meshes"
+        f"{number_of(len(loops), 'boundary')} of {sizes} edges closed by caps for the map, which "
+        f"have {percent:.0f} % of the area; left out of figures and exported meshes"
     )
     return whole, every, [line]
 

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.wording import number_of
 
 FARTHEST_POINTS = 5
 _SEAM_KEY = "surface.seam_vertices"
@@ -175,19 +176,20 @@ def disc_seam(
                 raise _seam_error(name, "out_of_range", reason)
         given = [int(graph.node[int(v)]) for v in seam_vertices]
         terminals += [v for v in dict.fromkeys(given) if v not in terminals]
-        log.append(f"seam through {len(given)} given vertices")
+        log.append(f"seam through {number_of(len(given), 'given vertex')}")
         if not graph.loops and genus == 0 and len(terminals) < 2:
             reason = "the surface is closed; give at least two different seam vertices"
             raise _seam_error(name, "too_few", reason)
     elif genus == 0 and almost_closed(vertices, faces, graph.loops):
         farthest = _farthest_points(graph, terminals, FARTHEST_POINTS)
         terminals += [v for v in farthest if v not in terminals]
-        log.append(f"seam through {len(farthest)} farthest points")
+        log.append(f"seam through {number_of(len(farthest), 'farthest point')}")
 
     seam = _shortest_seam(graph, edges, terminals, genus)
     if seam:
         log.append(
-            f"cut along {len(seam)} edges (genus {genus}, {len(graph.loops)} boundary loops)"
+            f"cut along {number_of(len(seam), 'edge')} (genus {genus}, "
+            f"{number_of(len(graph.loops), 'boundary loop')})"
         )
     return seam, log
 
@@ -205,7 +207,7 @@ def cut_along_paths(
     steps = [np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1) for path in paths]
     low, high = np.concatenate(steps).astype(np.int64).T
     seam = np.searchsorted(keys, low * len(vertices) + high).tolist()
-    log = [f"cut along {len(seam)} edges in {len(paths)} paths"]
+    log = [f"cut along {number_of(len(seam), 'edge')} in {number_of(len(paths), 'path')}"]
     return cut_open(vertices, faces, seam, log, name)
 
 
@@ -228,12 +230,12 @@ def cut_open(
     cut_faces, origin = topology.cut_along(faces, is_cut)
     if not topology.is_disc(cut_faces):
         euler, loops = topology.euler_characteristic(cut_faces), topology.boundary_loops(cut_faces)
-        found = f"Euler characteristic {euler}, {len(loops)} boundary loops"
+        found = f"Euler characteristic {euler}, {number_of(len(loops), 'boundary loop')}"
         reason = f"the seam does not leave a disc ({found}); give other {_SEAM_KEY}"
         raise _seam_error(name, "not_a_disc", reason)
     points, cut_faces, inserted = split_chords(vertices[origin], cut_faces)
     if inserted:
-        log = [*log, f"{inserted} interior edges between boundary vertices split"]
+        log = [*log, f"{number_of(inserted, 'interior edge')} between boundary vertices split"]
     origin = np.concatenate([origin, np.full(inserted, -1)])
     loop = topology.boundary_loops(cut_faces)[0]
     return Cut(points, cut_faces, origin, seam_pairs(origin), loop, tuple(log))

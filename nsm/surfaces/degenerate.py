@@ -6,6 +6,7 @@ import numpy as np
 
 from nsm.surfaces import topology
 from nsm.surfaces.loading import error_in
+from nsm.wording import number_of
 
 # A triangle is degenerate if its height over its longest side is below twice this share of the
 # bounding box's diagonal, about the precision of its coordinates. Small triangles are not.
@@ -20,7 +21,7 @@ def without_degenerate(
     limit = DEGENERATE_HEIGHT * diagonal
     distinct = distinct_corners(faces)
     if not distinct.all():
-        log.append(f"{int((~distinct).sum())} faces with a repeated vertex removed")
+        log.append(f"{number_of(int((~distinct).sum()), 'face')} with a repeated vertex removed")
     faces = faces[distinct]
     degenerate = _is_degenerate(vertices, faces, limit)
     if degenerate.all():
@@ -32,16 +33,16 @@ def without_degenerate(
         faces, flipped, removed = _flip_degenerate(vertices, faces, degenerate, limit)
         kept = faces[first_uses(faces)]
         if len(kept) == 0 or topology.euler_characteristic(kept) != before:
-            where = f"removing {removed} degenerate triangles would leave holes"
+            where = f"removing {number_of(removed, 'degenerate triangle')} would leave holes"
             reason = f"{where}; merge vertices by distance in a mesh editor"
             raise error_in(name, "degenerate", reason)
         if flipped:
-            log.append(f"{flipped} degenerate triangles removed by edge flips")
+            log.append(f"{number_of(flipped, 'degenerate triangle')} removed by edge flips")
         if removed:
-            log.append(f"{removed} degenerate triangles removed")
+            log.append(f"{number_of(removed, 'degenerate triangle')} removed")
     first = first_uses(faces)
     if not first.all():
-        log.append(f"{int((~first).sum())} duplicate faces removed")
+        log.append(f"{number_of(int((~first).sum()), 'duplicate face')} removed")
     return faces[first]
 
 

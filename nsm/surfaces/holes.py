@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nsm.surfaces import topology
+from nsm.wording import number_of
 
 # The numbers of inserted vertices: -2, -3, ...; -1 is taken by points that cuts insert.
 FIRST = -2
@@ -47,7 +48,7 @@ def fill(
         return vertices, faces, []
     sizes = ", ".join(str(len(loop)) for loop in holes[:8]) + (", ..." if len(holes) > 8 else "")
     kept = ", ".join(str(len(loop)) for loop in left[:8])
-    what = f"{len(holes)} hole{'s' if len(holes) > 1 else ''} of {sizes} edges"
+    what = f"{number_of(len(holes), 'hole')} of {sizes} edges"
     line = f"{what} filled for the map, left out of exported meshes"
     line += f"; open boundaries of {kept} edges stay" if left else ""
     return *fans(vertices, faces, holes), [line]

@@ -13,6 +13,7 @@ import numpy as np
 
 from nsm.surfaces.landmarks import Landmarks, listed
 from nsm.surfaces.loading import check_file, error_in
+from nsm.wording import number_of
 
 _LARGEST = 10_000_000  # bytes
 
@@ -69,7 +70,8 @@ def read_pairs(path: str | Path) -> tuple[Landmarks, Landmarks]:
     if isinstance(content, dict) and "landmarks" in content:
         lists = read_collection(file)
         if len(lists) != 2:
-            raise error_in(file, "wrong_type", f"landmarks of {len(lists)} surfaces; give two")
+            what = f"landmarks of {number_of(len(lists), 'surface')}"
+            raise error_in(file, "wrong_type", f"{what}; give two")
         return lists[0], lists[1]
     pairs = content.get("pairs") if isinstance(content, dict) else content
     if not isinstance(pairs, list) or not all(isinstance(p, list) and len(p) == 2 for p in pairs):

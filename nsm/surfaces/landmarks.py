@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from nsm.surfaces.loading import error_in
 from nsm.surfaces.location import Places
+from nsm.surfaces.validation import CleanMesh
 
 # vertices, MISSING for none; or points (L, 3) or places (L, 4), rows of NaN for none
 Landmarks = list[int] | np.ndarray
@@ -74,6 +75,28 @@ def as_vertices(
             raise error_in(name, "duplicate_landmark", reason)
         seen[vertex] = k
     return found
+
+
+def kept_landmarks(mesh: CleanMesh, landmarks: np.ndarray, name: str) -> np.ndarray:
+    """Landmarks, vertices (L,) of a mesh file, as vertices of the cleaned mesh; -1 for none.
+
+    Raises:
+        NsmError: ``not_on_surface``: one is not on the part that is kept; ``duplicate_landmark``:
+            the vertices of two are one vertex of the cleaned mesh.
+    """
+    kept = np.where(landmarks >= 0, mesh.merged[landmarks], MISSING)
+    seen: dict[int, int] = {}
+    for k, (given, vertex) in enumerate(zip(landmarks.tolist(), kept.tolist(), strict=True)):
+        if given >= 0 and vertex < 0:
+            reason = f"landmark {k}, vertex {given}, is not on the part that is kept; give another"
+            raise error_in(name, "not_on_surface", reason)
+        if vertex in seen and vertex != MISSING:
+            first = seen[vertex]
+            both = f"landmarks {first} and {k}, vertices {landmarks[first]} and {given}"
+            reason = f"{both}, are duplicates of one vertex; leave one out"
+            raise error_in(name, "duplicate_landmark", reason)
+        seen[vertex] = k
+    return kept
 
 
 def present(landmarks: Landmarks) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 from nsm.errors import NsmError
 from nsm.surfaces.obj import read_obj, text_of
 from nsm.surfaces.recent import Recent, content
+from nsm.wording import number_of
 
 _LONGEST_HEADER = 100_000  # bytes
 LARGEST_FILE = 4 * 2**30  # bytes
@@ -190,7 +191,7 @@ def _triangulated(vertices: Any, polygons: Sequence[Sequence[int]]) -> _Read:
     return (
         np.array(vertices, dtype=np.float64).reshape(-1, 3),
         flat[corners],
-        [f"{larger} polygons triangulated"] if larger else [],
+        [f"{number_of(larger, 'polygon')} triangulated"] if larger else [],
     )
 
 
@@ -210,8 +211,8 @@ def _read_off(file: Path) -> _Read:
         raise ValueError("the header has a negative count")
     if len(rows) < 1 + n_vertices + n_faces:
         raise ValueError(
-            f"the header announces {n_vertices} vertices and {n_faces} faces, "
-            f"but {len(rows) - 1} lines follow"
+            f"the header announces {number_of(n_vertices, 'vertex')} and "
+            f"{number_of(n_faces, 'face')}; after it: {number_of(len(rows) - 1, 'line')}"
         )
     vertices = [[float(x) for x in row[:3]] for row in rows[1 : 1 + n_vertices]]
     polygons = []
@@ -262,7 +263,8 @@ def _read_ply(file: Path) -> _Read:
         strips = elements["tristrips"]
         key = (strips.dtype.names or ("vertex_indices",))[0]
         faces = np.concatenate([_strip_triangles(np.asarray(row)) for row in strips[key]])
-        return vertices, faces, [f"triangle strips converted to {len(faces)} triangles"]
+        line = f"triangle strips converted to {number_of(len(faces), 'triangle')}"
+        return vertices, faces, [line]
     return vertices, np.zeros((0, 3), dtype=np.int64), []
 
 

@@ -16,6 +16,7 @@ from nsm.surfaces.loading import check_file, error_in
 from nsm.surfaces.obj import text_of
 from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import CleanMesh
+from nsm.wording import number_of
 
 UV, LINES = "uv", "lines"
 _KEY = "seams"
@@ -162,7 +163,7 @@ def charts(mesh: CleanMesh, pairs: np.ndarray, name: str) -> list[Cut]:
         used, number = topology.renumbered(faces[label == k], len(old))
         own, points = number[faces[label == k]], mesh.vertices[old[used]]
         if topology.is_disc(own):
-            log = [f"cut along {len(wanted)} given edges"]
+            log = [f"cut along {number_of(len(wanted), 'given edge')}"]
             parts.append(_of_whole(cut_open(points, own, [], log, name), old[used]))
         else:
             parts.append(_of_whole(cut_to_disc(points, own, name=name), old[used]))

@@ -21,6 +21,7 @@ from nsm.surfaces.degenerate import distinct_corners, first_uses, without_degene
 from nsm.surfaces.holes import fill
 from nsm.surfaces.loading import as_arrays, check_arrays, error_in
 from nsm.surfaces.recent import Recent, content
+from nsm.wording import number_of
 
 # Connected components below these shares of the area (each, and all together) are debris or
 # trimmings, such as eyeballs behind a face, and are removed. If others are larger, the user must
@@ -114,7 +115,7 @@ def _cleaned(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: Repair
     representative = _weld_short_edges(vertices, representative, faces, log)
     unreferenced = len(np.setdiff1d(representative, representative[faces]))
     if unreferenced:
-        log.append(f"{unreferenced} unreferenced vertices removed")
+        log.append(f"{number_of(unreferenced, 'unreferenced vertex')} removed")
     faces = without_degenerate(vertices, representative[faces], name, log)
     of_vertex = np.arange(len(vertices))
     if topology.edges_of(faces).count.max() > 2:
@@ -128,7 +129,7 @@ def _cleaned(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: Repair
     used = len(np.unique(faces))
     old = of_vertex[old]
     if len(old) > used:
-        log.append(f"{len(old) - used} non-manifold vertices split")
+        log.append(f"{number_of(len(old) - used, 'non-manifold vertex')} split")
         # components that were connected only by such a vertex are separate now
         split_faces = _keep_component(vertices[old], split_faces, name, repairs, log)
         kept = np.unique(split_faces)
@@ -169,9 +170,10 @@ def _weld_duplicates(vertices: np.ndarray, faces: np.ndarray, log: list[str]) ->
         return keep
     soup = len(faces) > 1 and len(np.unique(faces)) == faces.size
     if not soup and _makes_non_manifold(faces, representative[faces]):
-        log.append(f"{duplicates} duplicate vertices kept: welding would make edges non-manifold")
+        kept = number_of(duplicates, "duplicate vertex")
+        log.append(f"{kept} kept: welding would make edges non-manifold")
         return keep
-    log.append(f"{duplicates} duplicate vertices welded")
+    log.append(f"{number_of(duplicates, 'duplicate vertex')} welded")
     return representative
 
 
@@ -197,7 +199,7 @@ def _weld_short_edges(
     if _makes_non_manifold(joined, welded[faces]):
         return representative
     count = len(np.unique(joined)) - len(np.unique(welded[faces]))
-    log.append(f"{count} vertices welded across edges of zero length")
+    log.append(f"{number_of(count, 'vertex')} welded across edges of zero length")
     return welded
 
 
@@ -224,10 +226,10 @@ def _split_edges(
     count = int((edges.count > 2).sum())
     if repairs.repair is None:
         a, b = edges.pairs[int(edges.count.argmax())]
-        where = f"{count} non-manifold edges (three or more faces), such as {a}-{b}"
-        reason = f"{where}; surface.repair=split cuts them apart, or remove inner faces yourself"
+        where = f"{number_of(count, 'non-manifold edge')} (three or more faces), such as {a}-{b}"
+        reason = f"{where}; surface.repair=split cuts the mesh apart there, or remove inner faces"
         raise error_in(name, "non_manifold", reason)
-    log.append(f"cut apart at {count} non-manifold edges")
+    log.append(f"cut apart at {number_of(count, 'non-manifold edge')}")
     # a fan of faces around a copy ends at cut edges, so that at most two faces share each of them
     return topology.cut_along(faces, edges.count > 2)
 
@@ -246,8 +248,9 @@ def _keep_component(
     if repairs.parts is not None:
         number = 0 if repairs.parts == "largest" else int(repairs.parts)
         if not 0 <= number < count:
-            last = f"0 to {count - 1}" if count > 1 else "0"
-            reason = f"surface.parts={number}: the mesh has {count}; give {last}, or largest"
+            last = {1: "0", 2: "0, 1"}.get(count, f"0 to {count - 1}")
+            has = f"the mesh has {number_of(count, 'part')}"
+            reason = f"surface.parts={number}: {has}; give {last} or largest"
             raise error_in(name, "out_of_range", reason)
         part = int(order[number])
         log.append(f"1 of {count} connected components kept, {100 * share[part]:.2f} % of the area")
@@ -260,7 +263,9 @@ def _keep_component(
         reason = f"{where}; keep one with surface.parts=largest, or surface.parts=1 and so on"
         raise error_in(name, "disconnected", reason)
     dropped = 100 * others.sum()
-    log.append(f"{count - 1} small connected components removed ({dropped:.2f} % of the area)")
+    log.append(
+        f"{number_of(count - 1, 'small connected component')} removed ({dropped:.2f} % of the area)"
+    )
     return faces[label == largest]
 
 
@@ -292,5 +297,5 @@ def _orient(faces: np.ndarray, name: str, log: list[str]) -> np.ndarray:
         done[reached % n] = True
     faces = faces.copy()
     faces[flipped] = faces[flipped][:, [0, 2, 1]]
-    log.append(f"{int(flipped.sum())} faces flipped to a consistent orientation")
+    log.append(f"{number_of(int(flipped.sum()), 'face')} flipped to a consistent orientation")
     return faces

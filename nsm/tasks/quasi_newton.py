@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsm.maps import SplineField
+from nsm.stages import at as shown
+from nsm.stages import part
 from nsm.tasks.curvature import Curvature
 from nsm.tasks.spline_level import Level, Metric
 
@@ -139,12 +141,14 @@ class QuasiNewton(Optimizer):
             self._level = number, [Level(f, self.levels[number]) for f in self.fields]
         state["step"] += 1
         loss, hardly = None, True
-        for part in self.turns():
-            own = [module for module in part.modules() if isinstance(module, SplineField)]
+        for k, moving in enumerate(self.turns()):
+            own = [module for module in moving.modules() if isinstance(module, SplineField)]
             each = zip(self.fields, self._level[1], strict=True)
             self._moving = [(field, level) for field, level in each if field in own]
-            before = self._evaluated(closure, self._now())
-            after = None if before is None else self._descended(closure, before)
+            maps = len(self.fields) // len(own)
+            with part(f"map {k + 1}/{maps}" if maps > 1 else "quasi-Newton step"):
+                before = self._evaluated(closure, self._now())
+                after = None if before is None else self._descended(closure, before)
             if before is None or after is None:  # rolled back from a loss that is not finite
                 return None
             hardly &= before.value - after.value <= _CONVERGED * abs(before.value)
@@ -161,7 +165,8 @@ class QuasiNewton(Optimizer):
         """What is found after the iterations, from what is found at the present coefficients."""
         at, known = self._now(), self.curvatures()
         search = _Search(self.memory, self._metric(known), bool(known))
-        for _ in range(self.iterations):
+        for k in range(self.iterations):
+            shown("iteration", k, self.iterations, f"loss {found.value:.2e}")
             moved = self._searched(closure, search, at, found)
             if moved is None:
                 return None

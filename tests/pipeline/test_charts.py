@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import networkx
 import numpy as np
 import pytest
+import torch
 import trimesh
 from tiny import FLATTENING, TRAINING
 
@@ -74,6 +75,10 @@ def test_the_atlas_is_on_the_mesh_of_the_file(run):
     assert off.max() < 1e-6
 
 
+def test_the_glb_file_of_an_atlas_is_valid(run, valid_gltf):
+    assert valid_gltf(run[0]) == {"parameterized.glb"}
+
+
 def test_the_pattern_shows_every_chart_in_units_of_the_file(run):
     folder, atlas = run
     root = ElementTree.parse(folder / "pattern.svg").getroot()
@@ -92,19 +97,28 @@ def test_the_pattern_shows_every_chart_in_units_of_the_file(run):
     assert sorted(drawn) == pytest.approx(sorted(wanted), rel=1e-5)
 
 
-def test_a_pattern_has_the_area_of_the_surface_where_the_energy_does_not_see_it(run):
+def test_a_flattening_has_the_area_of_the_surface_where_the_energy_does_not_see_it(run):
     chart = run[1].charts[0]
     surface = chart.phi.surface
-    vertices = chart.phi.in_original_units(surface.vertices)
-    wanted = topology.face_areas(vertices, surface.faces).sum()
+    wanted = topology.face_areas(surface.vertices, surface.faces).sum()
 
-    def area(energy):
-        flat = in_file_units(replace(chart, config={"energy": {"_target_": energy}}))
-        return topology.face_areas(np.pad(flat, ((0, 0), (0, 1))), surface.faces).sum()
+    def of(energy):
+        return replace(chart, config={"energy": {"_target_": energy}})
 
-    kept = area("nsm.energies.SymmetricDirichlet")
-    assert kept == pytest.approx(area("mine.Conformal")) != pytest.approx(wanted, rel=1e-4)
-    assert area("nsm.energies.Conformal") == pytest.approx(wanted, rel=1e-6)
+    def area(uv):
+        return topology.face_areas(np.pad(uv, ((0, 0), (0, 1))), surface.faces).sum()
+
+    seen, unseen = of("nsm.energies.SymmetricDirichlet"), of("nsm.energies.Conformal")
+    kept = area(seen.uv)
+    assert kept == pytest.approx(area(of("mine.Conformal").uv))
+    assert kept != pytest.approx(wanted, rel=1e-4)
+    assert area(unseen.uv) == pytest.approx(wanted)
+    in_units = area(in_file_units(unseen)) * surface.scale**2
+    assert in_units == pytest.approx(wanted)
+    with torch.no_grad():
+        network = unseen.module()(torch.as_tensor(surface.uv))
+    np.testing.assert_allclose(network, unseen.uv, atol=1e-5)
+    assert unseen.certificate == seen.certificate
 
 
 def test_given_edges_cut_one_chart():
@@ -146,11 +160,12 @@ GIVEN = [
 ]
 
 
-def test_each_island_starts_from_its_coordinates(tmp_path):
+def test_each_island_starts_from_its_coordinates(tmp_path, capfd):
     vertices, faces, uv = flattened_from_poles()
     file = tmp_path / "ball (2).obj"
     TexturedMesh(vertices, faces, uv, np.full((4, 4, 3), 9, np.uint8)).export(file)
-    atlas = nsm.parameterize(file, overrides=GIVEN, folder=tmp_path / "run", progress=False)
+    shown = [word for word in GIVEN if word != "trainer.progress=false"]
+    atlas = nsm.parameterize(file, overrides=shown, folder=tmp_path / "run")
     assert len(atlas.charts) == 2
     for chart in atlas.charts:
         surface = chart.phi.surface
@@ -169,6 +184,10 @@ def test_each_island_starts_from_its_coordinates(tmp_path):
         assert np.abs(moved - wanted).max() < 0.02 * np.abs(wanted).max()
         both = [chart.metrics[name]["symmetric_dirichlet_median"] for name in ("given", "nsm")]
         assert both[1] == pytest.approx(both[0], rel=0.02)
+        name = surface.name
+        assert atlas.metrics[f"{name}, given UV"] == chart.metrics["given"]
+    printed = capfd.readouterr().out
+    assert printed.count("given UV") == 2 and "ball (2)-1" in printed
     again = nsm.load(tmp_path / "run")
     assert all(np.array_equal(a.uv, b.uv) for a, b in zip(again.charts, atlas.charts, strict=True))
 

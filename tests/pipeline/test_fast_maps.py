@@ -152,6 +152,15 @@ def test_a_fast_run_has_a_validation_curve_of_several_points(task):
     assert config.trainer.log_every == 1
 
 
+@pytest.mark.parametrize("task", ["overfit", "pair_map", "collection_map", "param"])
+@pytest.mark.parametrize("words", [[], ["experiment=adam"], ["experiment=quick"]])
+def test_every_run_has_a_validation_curve_of_several_points(task, words):
+    if task == "overfit" and words == ["experiment=adam"]:
+        return  # of maps
+    config = compose_config([f"task={task}", *words])
+    assert config.trainer.max_steps >= 2 * config.data.steps_per_epoch
+
+
 def collection_of(surfaces, folder, **extra):
     """The default training of three surfaces, in few steps; the third lacks the last landmark."""
     settings = [

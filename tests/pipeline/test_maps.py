@@ -114,6 +114,11 @@ def test_a_run_leaves_all_that_the_readme_names(made):
         assert (folder / name).stat().st_size > 0, name
 
 
+def test_glb_files_of_a_map_are_valid(made, valid_gltf):
+    names = {"mapped.glb", "morph.glb", "source_with_target_uv.glb", "target_with_source_uv.glb"}
+    assert valid_gltf(made[0]) == names
+
+
 def test_the_image_of_a_closed_mesh_is_a_closed_mesh(made, files):
     folder, f = made
     ball = trimesh.load(files / "ball.obj", process=False)
@@ -510,6 +515,7 @@ def test_textures_are_carried_both_ways_by_the_command(here, tmp_path):
 BAD = [
     ("landmarks=[[99999,1]]", "out_of_range", "a"),
     ("landmarks=[[1,1],[1,2]]", "duplicate_landmark", "a"),
+    ("source=twice.obj landmarks=[[0,0],[162,5]]", "duplicate_landmark", "twice"),
     ("landmarks=[a.vts,b.vts]", "different_lengths", "landmarks"),
     ("landmarks=nowhere.json", "missing_file", "nowhere.json"),
     ("landmarks=broken.json", "damaged_file", "broken.json"),
@@ -546,6 +552,11 @@ def bad_files(made, files, tmp_path_factory):
     (folder / "broken.json").write_text("[[1, 2")
     for name, mesh in (("a", "ball"), ("b", "egg")):
         shutil.copy(files / f"{mesh}.obj", folder / f"{name}.obj")
+    vertices, faces = (np.array(part) for part in load_mesh(folder / "a.obj")[:2])
+    corner = tuple(np.argwhere(faces == 0)[0])  # vertex 162 is a duplicate of vertex 0
+    faces[corner] = len(vertices)
+    twice = trimesh.Trimesh(np.vstack([vertices, vertices[:1]]), faces, process=False)
+    twice.export(folder / "twice.obj")
     return folder
 
 

@@ -179,7 +179,7 @@ def test_places_are_written_as_places(monkeypatch, tmp_path):
     answers(monkeypatch, 0.5)
     ids, found, said = take({"source": PLACES[0], "target": [50, 60]})
     count = len(meshes()[0].vertices)
-    assert ids[0][:2] == [count, count + 1] and "become vertices" in said
+    assert ids[0][:2] == [count, count + 1] and "become 2 vertices" in said
     (tmp_path / "landmarks.json").write_text(found.to_json())
     source, target = read_pairs(tmp_path / "landmarks.json")
     assert target == ids[1] and source[:2].tolist() == PLACES[0]

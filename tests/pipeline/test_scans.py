@@ -143,6 +143,10 @@ def test_the_command_takes_patterns(here, folder, monkeypatch):
     assert len(refused.stderr.strip().splitlines()) == 1
 
 
+def test_glb_files_of_a_collection_are_valid(run, valid_gltf):
+    assert "template_to_scan1/target_with_source_uv.glb" in valid_gltf(run[0])
+
+
 @pytest.fixture
 def shapes():
     vertices, faces = ring_mesh(3)

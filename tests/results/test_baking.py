@@ -87,6 +87,15 @@ def drawn(count: int, faces: int, seed: int = 0) -> Places:
     return Places(random.integers(0, faces, count), random.dirichlet(np.ones(3), count))
 
 
+def test_textured_glb_files_are_valid(tmp_path, valid_gltf):
+    end = case("disc").meshes[1]
+    uv = unwrapped(end.vertices, end.faces, size=64)
+    for name, channels in (("opaque", 3), ("transparent", 4)):
+        image = np.full((64, 64, channels), 128, np.uint8)
+        TexturedMesh(end.vertices, end.faces, uv, image).export(tmp_path / f"{name}.glb")
+    assert valid_gltf(tmp_path) == {"opaque.glb", "transparent.glb"}
+
+
 @pytest.mark.parametrize("back", [False, True])
 @pytest.mark.parametrize("domain", ["disc", "orbifold"])
 def test_a_point_has_the_colour_of_its_preimage(domain, back):

@@ -188,6 +188,7 @@ def test_the_command_begins_with_a_file_and_ends_without_an_error(
         ["a.obj", "b.obj", "--landmarks", "there.json", "--out", "new.json", "--port", "http"],
         ["a.obj", "b.obj", "--landmarks", "names.json"],
         ["a.obj", "b.obj", "--landmarks", "large.json"],
+        ["soup.obj", "b.obj", "--landmarks", "merged.json"],
         ["a.obj", "b.obj", "--parts", "big"],
         ["a.obj", "b.obj", "--parts", "9"],
     ],
@@ -197,6 +198,12 @@ def test_wrong_words_are_one_line_and_status_2(here, tmp_path, meshes, words):
     (tmp_path / "there.json").write_text('{"source": [1], "target": [2]}')
     (tmp_path / "names.json").write_text('{"source": [1], "target": [2], "names": ["a", "b"]}')
     (tmp_path / "large.json").write_text('{"source": [1], "target": [99999]}')
+    points, faces = sphere()
+    soup = np.arange(faces.size).reshape(-1, 3)  # triangles that share no vertices
+    twice = np.flatnonzero(faces.ravel() == faces[0, 0])[1]
+    trimesh.Trimesh(points[faces].reshape(-1, 3), soup, process=False).export(tmp_path / "soup.obj")
+    pairs = {"source": [0, int(twice)], "target": [3, 4]}
+    (tmp_path / "merged.json").write_text(json.dumps(pairs))
     run = here("landmarks", *words)
     assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
 

@@ -258,6 +258,16 @@ def test_exported_meshes_carry_uv(tmp_path, ending):
     assert np.allclose(mesh.visual.uv, 0.5 * (surface.uv + 1), atol=1e-6)
 
 
+def test_colours_of_vertices_are_linear_in_glb(tmp_path):
+    surface = square()
+    grey = np.full((len(surface.vertices), 3), 0.5)
+    export_mesh(tmp_path / "m.glb", surface.vertices, surface.faces, None, colours=grey)
+    (mesh,) = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
+    colours = mesh.visual.vertex_attributes["color"]
+    assert set(colours[:, :3].ravel()) == {55}  # 255 ((0.5 + 0.055) / 1.055)^2.4
+    assert b'"metallicFactor":0.0' in (tmp_path / "m.glb").read_bytes()  # by default, a mirror
+
+
 def test_unknown_mesh_ending_is_refused(tmp_path):
     surface = square()
     with pytest.raises(NsmError) as refused:
@@ -453,4 +463,9 @@ def test_landmarks_are_drawn_with_their_numbers(tmp_path):
     landmarks_picture(files[1], surfaces, [np.full(4, -1)] * 2)
     with_marks, without = (np.asarray(Image.open(f).convert("RGB"), dtype=int) for f in files)
     assert np.ptp(without, axis=2).max() < 10  # grey
-    assert (np.ptp(with_marks, axis=2) > 100).sum() > 50  # spheres
+    marked = np.ptp(with_marks, axis=2) > 100
+    assert marked.sum() > 50  # spheres
+    landmarks_picture(files[1], surfaces, [ids, np.array([0, 10, 20, 30])])
+    every = np.asarray(Image.open(files[1]).convert("RGB"), dtype=int)
+    # those that a surface lacks do not change the colours of the others
+    assert (every[marked] == with_marks[marked]).all(axis=1).mean() > 0.95

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from tiny import NETWORK, stirred
 
 from nsm.domains import Disc, Surface
 from nsm.errors import NsmError
@@ -26,7 +27,7 @@ from nsm.results import (
 from nsm.results.analytic import analytic_surface
 from nsm.results.render import UP_AXES
 from nsm.results.view.colours import as_lab, distinct_colours
-from nsm.results.view.glb import as_glb
+from nsm.results.view.glb import painted_glb
 from nsm.results.view.picking import hit, pick, pick_at
 from nsm.results.view.scene import PLAIN, POSITION, Paint, scene_of
 from nsm.surfaces.location import Places, locate
@@ -197,6 +198,28 @@ def test_a_point_and_its_image_have_one_colour(f):
     assert there == pytest.approx(at.take(colours[0].colours, scene.source.faces), abs=0.02)
 
 
+def test_no_triangle_of_a_closed_target_goes_around_the_domain():
+    ends = []
+    for k in range(2):
+        ball = trimesh.creation.icosphere(subdivisions=3)
+        turned = trimesh.transformations.rotation_matrix(k, [1, 2, 3])[:3, :3]
+        points = ball.vertices @ turned * [1, 1, 1.3]
+        surface = Surface.from_arrays(points, ball.faces, domain="orbifold")
+        ends.append(NeuralSurface(surface, stirred(NeuralMap(out_dim=3, **NETWORK))))
+    h = stirred(ends[0].surface.domain.equivariant(NeuralMap(out_dim=2, **NETWORK)))
+    scene = scene_of(SurfaceMap(*ends, h, np.zeros((0, 2), int)))
+    for name in ("checkerboard of the source", "checkerboard of the target"):
+        own, carried = (paint.checkerboard for paint in scene.paint(name))
+        faces = scene.target.faces
+        assert carried.shape == (len(faces), 3, 2)
+        assert np.abs(carried - carried[:, :1]).max() < 0.7  # the domain is 2 wide
+        values = scene.transferred(own)[faces].reshape(-1, 2)
+        same = scene.lift(carried.reshape(-1, 2), values)
+        np.testing.assert_allclose(same, values, atol=1e-9)
+        data = painted_glb(scene.target, scene.target.vertices, scene.paint(name)[1])
+        assert len(data) > 3 * len(faces) * 8 * 4  # a vertex for each corner
+
+
 def test_colours_follow_the_scale(f):
     scene = scene_of(f)
     scale = scene.scale("symmetric dirichlet")
@@ -264,11 +287,12 @@ def test_a_mesh_for_the_browser_has_its_colours_and_normals(closed):
     shape = scene_of(closed).source
     grey = Paint(np.full((len(shape.vertices), 3), 0.5), None)
     for paint in (grey, Paint(None, shape.uv)):
-        data = as_glb(shape, shape.vertices, paint)
+        data = painted_glb(shape, shape.vertices, paint)
         length, kind = struct.unpack("<I4s", data[12:20])
         gltf = json.loads(data[20 : 20 + length])
         (part,) = gltf["meshes"][0]["primitives"]
-        assert set(part["attributes"]) == {"POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0"}
+        own = "COLOR_0" if paint.checkerboard is None else "TEXCOORD_0"
+        assert set(part["attributes"]) == {"POSITION", "NORMAL", own}
         material = gltf["materials"][part["material"]]
         assert material["doubleSided"]
         textured = "baseColorTexture" in material["pbrMetallicRoughness"]

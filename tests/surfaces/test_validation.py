@@ -8,6 +8,7 @@ from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.catalogue import catalogue_mesh
 from nsm.surfaces.validation import Repairs, clean
+from nsm.wording import number_of
 
 TETRAHEDRON = (
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
@@ -39,7 +40,7 @@ def with_midpoints(parts: int) -> tuple[np.ndarray, np.ndarray]:
 def test_degenerate_triangles_are_flipped_without_a_hole(parts):
     vertices, faces = with_midpoints(parts)
     mesh = clean(vertices, faces)
-    assert f"{parts - 1} degenerate triangles removed by edge flips" in mesh.log
+    assert f"{number_of(parts - 1, 'degenerate triangle')} removed by edge flips" in mesh.log
     assert len(mesh.faces) == len(faces)
     assert topology.euler_characteristic(mesh.faces) == 2
     assert topology.boundary_loops(mesh.faces) == []
@@ -53,14 +54,14 @@ def test_degenerate_triangles_are_flipped_without_a_hole(parts):
 def test_a_degenerate_triangle_on_the_boundary_is_removed():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]])
     mesh = clean(vertices, np.array([[0, 3, 2], [3, 1, 2], [0, 1, 3]]))
-    assert "1 degenerate triangles removed" in mesh.log
+    assert "1 degenerate triangle removed" in mesh.log
     assert len(mesh.faces) == 2
 
 
 def test_unreferenced_and_duplicate_vertices_are_logged():
     vertices, faces = soup(*ball())
     mesh = clean(np.vstack([vertices, [[9.0, 9, 9]]]), faces)
-    assert "1 unreferenced vertices removed" in mesh.log
+    assert "1 unreferenced vertex removed" in mesh.log
     assert any("duplicate vertices welded" in line for line in mesh.log)
     assert mesh.merged[-1] == -1
     assert np.allclose(mesh.vertices[mesh.merged[:-1]], vertices)
@@ -74,7 +75,7 @@ def test_small_components_are_removed():
         np.vstack([vertices, 0.1 * crumb + 3]), np.vstack([faces, crumb_faces + len(vertices)])
     )
     assert len(mesh.faces) == len(faces)
-    assert any("small connected components removed" in line for line in mesh.log)
+    assert any("small connected component" in line for line in mesh.log)
     assert (mesh.merged[-4:] == -1).all()
 
 
@@ -84,7 +85,7 @@ def test_a_non_manifold_vertex_is_split():
     pinched = faces.copy()
     pinched[pinched == 1024] = 0
     mesh = clean(vertices, pinched)
-    assert any("non-manifold vertices split" in line for line in mesh.log)
+    assert any("1 non-manifold vertex split" in line for line in mesh.log)
     assert topology.euler_characteristic(mesh.faces) == 0
 
 

@@ -16,6 +16,7 @@ from nsm.domains.orbifold.multiresolution import Effort, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.domains.orbifold.tutte import upright
 from nsm.errors import NsmError
+from nsm.wording import number_of
 
 # Ω is R²/Γ with the lattice 2Z x 2Z: coordinates of Ω are twice those of the lattice.
 SIDE = 2.0
@@ -208,8 +209,9 @@ def _canonical(
     embedding = Embedding(faces, SIDE * x, lift, upright(lattice), cones, log)
     found = embedding.certificate()
     if not found.injective:
+        flipped = number_of(int(found.flipped.sum()), "flipped triangle")
         raise NsmError(
-            f"the embedding is not injective ({int(found.flipped.sum())} triangles flipped)",
+            f"the embedding is not injective ({flipped})",
             kind="not_injective",
         )
     return embedding

@@ -19,6 +19,7 @@ from nsm.results.meshes import by_position
 from nsm.results.view.colours import distinct_colours
 from nsm.results.view.picking import hit
 from nsm.results.view.scene import FIELD_OF_VIEW, beside_the_panel
+from nsm.wording import number_of
 
 _GAP = 1.3  # between the middles of shapes, in diameters
 _RADIUS = 0.02  # of a marker; every shape has the diameter one
@@ -136,7 +137,7 @@ class LandmarkEditor:
             self.message.content = f"not saved: {error.strerror}"
             return
         missing = f", {left} left out that are not on all shapes" if left else ""
-        self.message.content = f"{len(names)} landmarks saved in {self.file}{missing}"
+        self.message.content = f"{number_of(len(names), 'landmark')} saved in {self.file}{missing}"
 
     def check(self) -> None:
         """Colour the first shape by position, the others as their coarse maps carry it there."""

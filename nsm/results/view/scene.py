@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 
@@ -112,7 +113,8 @@ class Scale(NamedTuple):
 
 
 class Paint(NamedTuple):
-    """Colours of the vertices (V, 3) in [0, 1], or their coordinates (V, 2) on a checkerboard."""
+    """Colours of the vertices (V, 3) in [0, 1], or their coordinates (V, 2) on a checkerboard, or
+    those (F, 3, 2) of the corners of the faces."""
 
     colours: np.ndarray | None
     checkerboard: np.ndarray | None
@@ -132,6 +134,7 @@ class Scene:
         energies: for each name, values (F,) on the source's triangles.
         errors: for each name, values (V,) at its vertices.
         locate: where points (N, 2) of the target's domain lie on a mesh over it: uv (V, 2), faces.
+        lift: on a closed domain, the representatives of points (N, 2) nearest to others (N, 2).
         unreached: mask (W,) of the target's vertices to which no point of the source goes; None:
             there are none.
     """
@@ -145,6 +148,7 @@ class Scene:
     energies: dict[str, np.ndarray]
     errors: dict[str, np.ndarray] = field(default_factory=dict)
     locate: Callable[[np.ndarray, np.ndarray, np.ndarray], Places] = locate
+    lift: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     unreached: np.ndarray | None = None
 
     @property
@@ -180,8 +184,7 @@ class Scene:
         """The paint of both shapes; a point and its image have the same colour."""
         if name in self.checkerboards:
             checkerboard = self.checkerboards[name]
-            carried = self._shown(self.transferred(checkerboard), _ONE_SQUARE)
-            return Paint(None, checkerboard), Paint(None, carried)
+            return Paint(None, checkerboard), Paint(None, self._carried(checkerboard))
         vertices = self.source.vertices
         scale = self.scale(name)
         if scale is not None:
@@ -193,6 +196,20 @@ class Scene:
         if name == POSITION:
             colours = by_position(vertices)
         return Paint(colours, None), Paint(self._shown(self.transferred(colours), GREY), None)
+
+    def _carried(self, checkerboard: np.ndarray) -> np.ndarray:
+        """A checkerboard of the source, (V, 2), on the target: (W, 2), or (G, 3, 2) at the corners
+        of its faces, where the source's lifts differ from vertex to vertex."""
+        carried = self.transferred(checkerboard)
+        if self.lift is None:
+            return self._shown(carried, _ONE_SQUARE)
+        faces = self.target.faces
+        corners = carried[faces]
+        for k in (1, 2):
+            corners[:, k] = self.lift(corners[:, k], corners[:, 0])
+        if self.unreached is not None:
+            corners[self.unreached[faces].any(axis=1)] = _ONE_SQUARE
+        return corners
 
     def _shown(self, carried: np.ndarray, nothing: np.ndarray) -> np.ndarray:
         """Values (W, d) at the target's vertices, with ``nothing`` (d,) where no point goes."""
@@ -277,7 +294,7 @@ def _overfit(neural: NeuralSurface, frame: np.ndarray) -> Scene:
     energies = _energies(s, image)
     locate = s.domain.locate
     shown = (source, target, s.uv, target.vertices, frame)
-    return Scene(*shown, checkerboards, energies, errors, locate)
+    return Scene(*shown, checkerboards, energies, errors, locate, _lift(s))
 
 
 def _flattening(result: Parameterization, frame: np.ndarray) -> Scene:
@@ -338,7 +355,21 @@ def _pair(f: SurfaceMap, frame: np.ndarray) -> Scene:
     image = f.aligned_image - centre
     energies, locate = _energies(s, f.image), s.domain.locate
     shown = (source, target, f.image_uv, image, frame)
-    return Scene(*shown, checkerboards, energies, locate=locate, unreached=unreached)
+    lift = _lift(s)
+    return Scene(*shown, checkerboards, energies, {}, locate, lift, unreached)
+
+
+def _lift(surface: Surface) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+    """Of a surface on a closed domain, as :attr:`Scene.lift`."""
+    if surface.domain.has_boundary:
+        return None
+
+    def lift(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+        pair = torch.from_numpy(points), torch.from_numpy(near)
+        lifted: np.ndarray = surface.domain.lift(*pair, surface.lattice).numpy()
+        return lifted
+
+    return lift
 
 
 def _file_shape(

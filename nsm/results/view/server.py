@@ -19,7 +19,7 @@ from nsm.optional_dependencies import needed
 from nsm.results.collection import SurfaceCollection
 from nsm.results.render import UP_AXES, axis_of
 from nsm.results.view.colours import distinct_colours
-from nsm.results.view.glb import as_glb
+from nsm.results.view.glb import painted_glb
 from nsm.results.view.picking import Pick, pick
 from nsm.results.view.scene import Shown, scene_of
 
@@ -163,7 +163,7 @@ class Viewer:
             self.scene.offsets,
             strict=True,
         ):
-            data = as_glb(shape, vertices, paint)
+            data = painted_glb(shape, vertices, paint)
             self.server.scene.add_glb(f"{node}/mesh", data, position=offset)
         scale = self.scene.scale(name)
         self._bar.visible = self._bar_ends.visible = scale is not None
