@@ -66,8 +66,8 @@ def repaired(
 ) -> np.ndarray:
     """The image with flipped triangles turned back where possible, copies moving together.
 
-    See :func:`nsm.domains.reinsertion.turned_back`: energy and Jacobians of triangles are the same in
-    all lifts, so that patches across copies and around cones need no unfolding.
+    See :func:`nsm.domains.reinsertion.turned_back`: energy and Jacobians of triangles are the same
+    in all lifts, so that patches across copies and around cones need no unfolding.
 
     Args:
         rest: (V, 2) the vertices in the plane, no triangle flipped.
