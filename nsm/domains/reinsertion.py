@@ -93,8 +93,10 @@ def turned_back(
     """
     for stay in (fixed | held, fixed):
         image = untangled(rest, faces, image, stay, copies)
-        image = reinserted(rest, faces, image, stay, copies)
-    return image
+        mended = reinserted(rest, faces, image, stay, copies)
+        if not flipped(mended, faces).any():
+            break  # one that is mended in part only is no good start for a descent
+    return mended
 
 
 @dataclass(frozen=True)

@@ -51,9 +51,9 @@ def _of_flips(f: SurfaceMap) -> str:
         )
     if needles == len(faces):
         return said
-    said += "; otherwise " if needles else ""
-    if not len(f.landmarks):
-        return said + "give landmarks, or more steps (trainer.max_steps)"
-    marks = f.source.file_mesh()[0][f.landmarks[:, 0]]
-    nearest = int(np.linalg.norm(marks - at, axis=1).argmin())
-    return said + f"correct or leave out landmark {nearest}, which is nearest to there"
+    advice = "give landmarks, or more steps (trainer.max_steps)"
+    if len(f.landmarks):
+        marks = f.source.file_mesh()[0][f.landmarks[:, 0]]
+        nearest = int(np.linalg.norm(marks - at, axis=1).argmin())
+        advice = f"correct or leave out landmark {nearest}, which is nearest to there"
+    return f"{said}; otherwise {advice}" if needles else said + advice[0].upper() + advice[1:]

@@ -54,7 +54,7 @@ def test_a_map_that_flips_is_repaired(ends, tmp_path):
     assert told["certified"] is False and told["flipped_triangles"] > 0
     assert told["flipped_triangles"] == told["before_repair"]["flipped_triangles"]
     (warning,) = [line for line in told["warnings"] if "NOT certified" in line]
-    assert "correct or leave out landmark" in warning and "thinner" not in warning
+    assert "Correct or leave out landmark" in warning and "thinner" not in warning
     f, repaired = forced(ends, tmp_path / "repaired")
     assert repaired["certified"] is True and repaired["flipped_triangles"] == 0
     assert repaired["before_repair"] == told["before_repair"]

@@ -38,7 +38,7 @@ def test_a_certified_map_has_no_faults():
     ("flips", "words", "others"),
     [
         ([0], ["1 of them are thinner", "remesh"], ["landmark"]),
-        ([2], ["(30, 3.33333, 0)", "leave out landmark 1"], ["thinner"]),
+        ([2], ["(30, 3.33333, 0)", "Correct or leave out landmark 1"], ["thinner"]),
         ([0, 2], ["1 of them are thinner", "otherwise correct or leave out landmark 1"], []),
     ],
 )
@@ -49,6 +49,6 @@ def test_the_cause_and_what_to_do_are_told(flips, words, others):
 
 
 def test_faults_without_flips_or_landmarks_are_told_too():
-    assert "give landmarks" in warning_of_faults("a → b", sample([2], landmarks=())).plain
+    assert "Give landmarks" in warning_of_faults("a → b", sample([2], landmarks=())).plain
     said = warning_of_faults("a → b", sample([], boundary_order_violations=2)).plain
     assert "2 boundary order violations" in said and "Train longer" in said
