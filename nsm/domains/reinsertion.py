@@ -22,7 +22,7 @@ from nsm.domains.vertex_relaxation import Freedom, Stars, relax
 from nsm.stages import counted
 from nsm.surfaces.predicates import orientation
 
-_MOST = 20_000  # vertices removed
+_MOST = 5000  # vertices removed: it takes some milliseconds for each
 _CROWD = 9  # neighbours of a vertex: with more, it is drawn into another rather
 _ROOM = 1e-6  # of the area that a triangle should have: what a vertex leaves in its first place
 _NEARER, _TRIES = 0.5, 30  # from a place towards the vertex that it was drawn into
@@ -162,28 +162,38 @@ class _Mesh:
         self.bad = set(np.flatnonzero(flipped(image, faces)).tolist())
 
     def without_flips(self) -> Iterator[_Removed]:
-        """Take vertices out, until no triangle is flipped or none can be taken out."""
+        """Take vertices out, until no triangle is flipped or none can be taken out: those of
+        flipped triangles, and where that does not help their neighbours."""
         queue: list[tuple[tuple[float, ...], int, int, int]] = []
         version = np.zeros(len(self.held), dtype=np.int64)
 
         def look(vertices: set[int]) -> None:
             for v in vertices:
                 version[v] += 1
-                if not self.held[v] and not self.bad.isdisjoint(self.around[v]):
+                if not self.held[v]:
                     for cost, w in self._options(v):
                         heapq.heappush(queue, (cost, v, w, int(version[v])))
 
-        look({v for f in self.bad for v in self.vertex[f].tolist()})
+        look(self._of_flips())
         count = 0
-        while self.bad and queue and count < _MOST:
+        while self.bad and count < _MOST:
+            if not queue:
+                around = set().union(*map(self._ring, self._of_flips()))
+                look(around - self._of_flips())
+                if not queue:
+                    break
             _, v, w, of = heapq.heappop(queue)
             if of != version[v]:
                 continue
             near = self._ring(v) | self._ring(w) | {w}
             yield self._drawn(v, w)
-            version[v] += 1
+            version[[v, *near]] += 1
             count += 1
-            look(near - {v})
+            look(self._of_flips() & near)
+
+    def _of_flips(self) -> set[int]:
+        """The vertices of flipped triangles."""
+        return {v for f in self.bad for v in self.vertex[f].tolist()}
 
     def _ring(self, v: int) -> set[int]:
         return {u for f in self.around[v] for u in self.vertex[f].tolist()} - {v}
@@ -284,7 +294,7 @@ class _Mesh:
             least = _ROOM * size * max(float(now.sum()), 0.0) / float(size.sum())
             if (now > least).all() and not star.turned(own):
                 return False
-        for at in self._places(star, rest, size):
+        for at in self._places(star, one.target, rest, size):
             at = self.copies.rounded(at[None])[0]
             if not star.turned(at):
                 self.place[v, 0] = at
@@ -313,7 +323,11 @@ class _Mesh:
         if np.isfinite(at).all() and not star.turned(at):
             self.place[v, 0] = at
 
-    def _places(self, star: _Star, rest: np.ndarray, size: np.ndarray) -> Iterator[np.ndarray]:
+    def _places(
+        self, star: _Star, target: int, rest: np.ndarray, size: np.ndarray
+    ) -> Iterator[np.ndarray]:
+        """Places (2,) for a vertex, the best first: as its neighbours were around it, innermost,
+        and beside the vertex that it was drawn into."""
         inner = innermost(star.of_b[:, 0], star.of_c[:, 0]) if len(size) <= _MOST_SIDES else None
         if (size > 0).all():
             wanted = _mean_value(rest, star)
@@ -323,6 +337,13 @@ class _Mesh:
                     yield inner + _NEARER**k * (wanted - inner)
         if inner is not None:
             yield inner
+        sides = (star.of_c - star.of_b)[(star.b == target) | (star.c == target), 0]
+        inwards = np.stack([-sides[:, 1], sides[:, 0]], axis=1)
+        lengths = np.linalg.norm(sides, axis=1)
+        inwards = (inwards / np.maximum(lengths, 1e-300)[:, None]).sum(axis=0)
+        at = star.of_b[star.b == target, 0][0]
+        for k in range(1, _TRIES):
+            yield at + _NEARER**k * lengths.min() * inwards
 
 
 def _mean_value(at: np.ndarray, star: _Star) -> np.ndarray:
