@@ -111,3 +111,14 @@ def test_the_innermost_point_of_a_star_sees_all_its_sides(seed):
         assert found.min() >= heights.min() * (1 - 1e-9)
     elif at is not None:
         assert (cross(b - at, c - at) > 0).all()
+
+
+def test_a_vertex_held_far_from_its_place_is_made_room_for():
+    center = int(np.linalg.norm(DISC - [0.2, 0.1], axis=1).argmin())
+    image = DISC.copy()
+    image[center] += [0.35, 0.05]
+    fixed = rim_of(DISC, FACES)
+    fixed[center] = True
+    result = reinserted(DISC, FACES, image, fixed)
+    assert flipped(image, FACES).any() and not flipped(result, FACES).any()
+    assert (result[fixed] == image[fixed]).all()
