@@ -102,9 +102,7 @@ def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypot
     """Hypotheses, best first, those that are nearly as good as the first in the order of finer
     maps."""
     first = kept[0].score
-    near = [h for h in kept if h.good and h.score <= first + LEAST_MARGIN]
-    if len(near) < 2 or not kept[0].good:
-        return kept
+    near = [h for h in kept if h.score <= first + LEAST_MARGIN]
     at("finer maps")
     scores = finer_scores(meshes, [h.candidate for h in near], [h.vertices for h in near])
     if not np.isfinite(scores).all():
