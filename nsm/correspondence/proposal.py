@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
+from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
+from nsm.correspondence.finer_maps import Mesh, finer_scores
 from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
-from nsm.stages import counted
+from nsm.stages import at, counted
 
 # two maps differ if their images are this far apart in the mean, over √area, or if they take an end
 # of a limb to ends of two limbs
@@ -30,7 +31,8 @@ class Hypothesis:
         vertices: (L, 2) corresponding vertices of source and target: landmarks that were given;
             tips that the map brings near to each other; cones of the orbifold that are no tips,
             only where the others are fewer than four.
-        score: of the coarse map; lower is better.
+        score: of the coarse map; lower is better. Of those that hardly differ, the best has the
+            best score, and the others are as far behind as finer maps are.
         whole: whether all tips of one shape go to tips of the other.
         candidate: the coarse map.
     """
@@ -52,7 +54,8 @@ class Proposal:
 
     Attributes:
         hypotheses: one or more.
-        margin: by how much the score of the second is above that of the first.
+        margin: by how much the score of the second is above that of the first; or less, if it was
+            less before finer maps were compared.
         given: how many landmarks were given; they come first in each hypothesis.
     """
 
@@ -85,8 +88,29 @@ def proposed(
     meshes = (source, target)
     shapes = [coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)]
     kept = hypotheses(*shapes)
-    margin = kept[1].score - kept[0].score if len(kept) > 1 else np.inf
-    return Proposal(kept, margin, len(given))
+    margin = _margin(kept)
+    if margin <= LEAST_MARGIN and len(given) < COMMON:
+        kept = _told_apart(kept, meshes)
+    return Proposal(kept, min(margin, _margin(kept)), len(given))
+
+
+def _margin(kept: list[Hypothesis]) -> float:
+    return kept[1].score - kept[0].score if len(kept) > 1 else np.inf
+
+
+def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypothesis]:
+    """Hypotheses, best first, those that are nearly as good as the first in the order of finer
+    maps."""
+    first = kept[0].score
+    near = [h for h in kept if h.score <= first + LEAST_MARGIN]
+    at("finer maps")
+    scores = finer_scores(meshes, [h.candidate for h in near], [h.vertices for h in near])
+    if not np.isfinite(scores).all():
+        return kept
+    scores = first + scores - scores.min()
+    better = [replace(h, score=float(value)) for h, value in zip(near, scores, strict=True)]
+    others = [h for h in kept if all(h is not one for one in near)]
+    return sorted([*better, *others], key=lambda h: h.score)
 
 
 def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from nsm.domains import embedding, planar_mesh, untangling
+from nsm.domains.reinsertion import turned_back
 from nsm.surfaces.location import Places, locate
 from nsm.surfaces.topology import boundary_loops
 
@@ -399,9 +400,7 @@ class BoundedDomain(Domain):
         image = image.copy()
         if planar_mesh.order_violations(image[loop]):
             image[loop] = self.in_order(image[loop], rest[loop])
-        for stay in (fixed | held, fixed):
-            image = untangling.untangled(rest, faces, image, stay)
-        return image
+        return turned_back(rest, faces, image, fixed, held)
 
     def in_order(self, points: np.ndarray, rest: np.ndarray) -> np.ndarray:
         """Points (B, 2) of ∂Ω, moved along it into the order of a loop where they are not.

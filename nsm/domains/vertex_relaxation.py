@@ -121,15 +121,22 @@ class Stars:
 @dataclass(frozen=True)
 class Freedom:
     """Where vertices may move: those of a mask (V,) along ∂Ω, held ones not at all, the others
-    freely."""
+    freely. Without a domain, none is on ∂Ω."""
 
     on_boundary: np.ndarray
     held: np.ndarray
-    domain: BoundedDomain
+    domain: BoundedDomain | None = None
+
+    @classmethod
+    def whole(cls, count: int) -> Freedom:
+        """That of so many vertices, which may all move freely."""
+        none = np.zeros(count, dtype=bool)
+        return cls(none, none)
 
     def retract(self, points: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Points (N, 2), changed in place: those of a mask (N,) are brought back to ∂Ω."""
-        points[which] = self.domain.retract(points[which])
+        if self.domain is not None:
+            points[which] = self.domain.retract(points[which])
         return points
 
 
@@ -138,7 +145,7 @@ def relax(uv: np.ndarray, stars: Stars, freedom: Freedom) -> None:
     energy, gradient, second = stars.derivatives(uv)
     on_boundary, here = freedom.on_boundary[stars.vertex], uv[stars.vertex]
     direction = _newton(gradient, second)
-    if on_boundary.any():
+    if freedom.domain is not None and on_boundary.any():
         place, g, h = here[on_boundary], gradient[on_boundary], second[on_boundary]
         t = freedom.domain.tangents(place)
         along = (g * t).sum(axis=1)

@@ -41,6 +41,7 @@ from nsm.results import (
     map_image,
     transfer_matrix_picture,
     warning_of_distortion,
+    warning_of_faults,
     warning_of_missed_landmarks,
     warning_of_tears,
     write_correspondences,
@@ -272,6 +273,7 @@ class CollectionMapTask(Task):
             warning_of_distortion(pairs),
             warning_of_missed_landmarks(pairs),
             *(warning_of_tears(name, of) for name, of in pairs.items()),
+            *(warning_of_faults(n, result.pair(*e)) for e, n in result.pair_names.items()),
         )
         return [warning for warning in found if warning is not None]
 

@@ -45,6 +45,7 @@ from nsm.results import (
     reliability_picture,
     transfer_picture,
     warning_of_distortion,
+    warning_of_faults,
     warning_of_folds,
     warning_of_missed_landmarks,
     warning_of_no_landmarks,
@@ -278,6 +279,7 @@ class PairMapTask(Task):
             warning_of_folds({name: result.metrics}),
             warning_of_missed_landmarks({name: result.metrics}),
             warning_of_tears(name, result.metrics),
+            warning_of_faults(name, result),
         )
         return [warning for warning in found if warning is not None]
 

@@ -6,6 +6,7 @@ from nsm.results.baking import baked
 from nsm.results.collection import SurfaceCollection, collection_metrics, load_collection
 from nsm.results.collection_pictures import figures_picture, transfer_matrix_picture
 from nsm.results.composed_map import ComposedMap, write_correspondences
+from nsm.results.faults import warning_of_faults
 from nsm.results.files import atomic_write
 from nsm.results.map_metrics import planar_metrics
 from nsm.results.meshes import export_mesh, export_surface
@@ -71,6 +72,7 @@ __all__ = [
     "pair_table",
     "transfer_picture",
     "warning_of_distortion",
+    "warning_of_faults",
     "warning_of_folds",
     "warning_of_missed_landmarks",
     "warning_of_no_landmarks",

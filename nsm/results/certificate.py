@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nsm.domains import Domain
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped
-from nsm.domains.untangling import untangled
+from nsm.domains.reinsertion import turned_back
 from nsm.surfaces.topology import boundary_loops
 from nsm.wording import number_of
 
@@ -113,9 +113,7 @@ def repaired(
     """
     if domain is not None:
         return domain.repaired(rest, faces, image, held, copies)
-    for stay in (held, np.zeros_like(held)):
-        image = untangled(rest, faces, image, stay)
-    return image
+    return turned_back(rest, faces, image, np.zeros_like(held), held)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 
 import numpy as np
@@ -15,6 +16,14 @@ def evaluate(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
     """φ at points (N, 2) of Ω, as float64 (N, 3)."""
     with torch.no_grad():
         return torch.cat([phi(chunk) for chunk in _chunks(phi, uv)]).double().cpu().numpy()
+
+
+def evaluate_double(h: nn.Module, uv: np.ndarray) -> np.ndarray:
+    """A map h of the plane at points (N, 2), as float64 (N, 2), computed in double precision.
+
+    A thin triangle's corners lie nearer to a line than single precision tells.
+    """
+    return evaluate(copy.deepcopy(h).cpu().double(), uv)
 
 
 def evaluate_jacobian(phi: nn.Module, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

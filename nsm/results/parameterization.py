@@ -19,8 +19,8 @@ from nsm.domains.planar_mesh import signed_areas
 from nsm.maps import Placed, PlanarMap
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, certificate, repaired
+from nsm.results.evaluation import evaluate_double
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
-from nsm.results.metrics import evaluate
 from nsm.results.networks import network_of
 from nsm.results.points import as_points
 from nsm.surfaces.location import locate
@@ -80,7 +80,7 @@ class Parameterization:
     @cached_property
     def _laid(self) -> np.ndarray:
         """The coordinates (V, 2) as h gives them, with the correction."""
-        return self.correction.of(evaluate(self.map, self.phi.surface.uv))
+        return self.correction.of(evaluate_double(self.map, self.phi.surface.uv))
 
     @cached_property
     def _size(self) -> float:

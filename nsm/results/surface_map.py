@@ -21,9 +21,9 @@ from nsm.results.artifact import NeuralSurface, save_surface
 from nsm.results.certificate import INTO, Correction, certificate, repaired, statement
 from nsm.results.composed_map import ComposedMap, composed, correspondence_matrix, transferred
 from nsm.results.devices import as_device
+from nsm.results.evaluation import evaluate_double
 from nsm.results.file_faces import FileFaces
 from nsm.results.files import write_pair
-from nsm.results.metrics import evaluate
 from nsm.results.morph_target import write_morph
 from nsm.results.points import as_points
 from nsm.results.pointwise import (
@@ -227,7 +227,7 @@ class SurfaceMap:
         if self.vertex_image is not None:
             return self.vertex_image
         s = self.source.surface
-        return s.domain.copied(s.uv, s.seam_pairs, evaluate(self.map, s.uv))
+        return s.domain.copied(s.uv, s.seam_pairs, evaluate_double(self.map, s.uv))
 
     @cached_property
     def image_uv(self) -> np.ndarray:

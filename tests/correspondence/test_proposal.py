@@ -1,11 +1,13 @@
 """Proposals without landmarks on shapes whose correspondence is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from limbs import LIMBS, star
 
-from nsm.correspondence import proposal, proposed, proposed_for_all, search
+from nsm.correspondence import finer_maps, proposal, proposed, proposed_for_all, search
 from nsm.correspondence.coarse_shape import coarse_shape
 from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
 from nsm.correspondence.mending import left_apart, mended
@@ -51,6 +53,8 @@ def quick(monkeypatch):
     monkeypatch.setattr(search, "_TARGET_SETS", 6)
     monkeypatch.setattr(proposal, "candidates", lambda s, t: search.candidates(s, t, rounds))
     monkeypatch.setattr(proposal, "MENDING", ())
+    monkeypatch.setattr(finer_maps, "FACES", 1200)
+    monkeypatch.setattr(finer_maps, "ROUNDS", (Round(0, 4, 15), Round(0, 6, 15)))
 
 
 def test_a_turned_and_stretched_shape_is_recognised(pair, quick):
@@ -206,6 +210,32 @@ def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch
         assert limb.argmin() == its.argmin()
         left.add(int(limb.argmin()))
     assert left == {3, 4}
+
+
+def test_finer_maps_tell_the_right_one_of_two_that_hardly_differ(pair, quick, monkeypatch):
+    source, target, _ = pair
+    first, second = proposed(source, target).hypotheses[:2]
+    candidates = [second.candidate, first.candidate]
+    scores = finer_maps.finer_scores(
+        (source, target), candidates, [second.vertices, first.vertices]
+    )
+    assert np.isfinite(scores).all() and scores[1] < scores[0]
+    # a tie, with the wrong one ahead
+    tie = [
+        replace(second, score=1.0, whole=True),
+        replace(first, score=1.1, whole=True),
+        replace(first, score=1.5, whole=False),  # too far behind to be compared
+    ]
+    monkeypatch.setattr(proposal, "hypotheses", lambda *_: tie)
+    found = proposed(source, target)
+    best = found.hypotheses[0]
+    assert best.candidate is first.candidate and best.whole and best.score == 1.0
+    assert not found.sure and len(found.hypotheses) == 3
+    assert found.margin == pytest.approx(0.1)  # the tie of the coarse maps stays one
+    # of clear differences, and of five landmarks or more, no finer maps are made
+    monkeypatch.setattr(proposal, "finer_scores", None)
+    monkeypatch.setattr(proposal, "hypotheses", lambda *_: [tie[0], replace(tie[1], score=1.5)])
+    assert proposed(source, target).sure
 
 
 def test_a_collection_is_matched_with_one_hub(pair, quick):

@@ -53,9 +53,12 @@ def test_a_map_that_flips_is_repaired(ends, tmp_path):
     _, told = forced(ends, tmp_path / "plain", "certification.repair=false")
     assert told["certified"] is False and told["flipped_triangles"] > 0
     assert told["flipped_triangles"] == told["before_repair"]["flipped_triangles"]
+    (warning,) = [line for line in told["warnings"] if "NOT certified" in line]
+    assert "Correct or leave out landmark" in warning and "thinner" not in warning
     f, repaired = forced(ends, tmp_path / "repaired")
     assert repaired["certified"] is True and repaired["flipped_triangles"] == 0
     assert repaired["before_repair"] == told["before_repair"]
+    assert not any("NOT certified" in line for line in repaired["warnings"])
     assert f.metrics["flipped_percent"] == 0 and f.metrics["certified"] is True
     share = 100 * told["before_repair"]["flipped_triangles"] / len(ends[0].surface.faces)
     assert f.metrics["flipped_before_repair_percent"] == pytest.approx(share)

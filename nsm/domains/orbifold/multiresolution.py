@@ -8,12 +8,12 @@ no descent comes back from there. On a few hundred triangles it does not; each r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from nsm.domains.coarse_to_fine import mean_values
 from nsm.domains.decimation import Round, coarsen, undo
+from nsm.domains.kernels import innermost
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
 from nsm.domains.orbifold.newton import Quotient
@@ -303,7 +303,7 @@ def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Rou
     missing = _placed(uv, stars, b, c, target, place)
     for number in missing.tolist():
         mine = stars.star == number
-        at = _innermost(b[mine], c[mine])
+        at = innermost(b[mine], c[mine], _LEAST_ROOM)
         if at is None:
             raise NsmError("a vertex finds no place without a flip", kind="not_injective")
         uv[step.vertex[number]] = at
@@ -335,27 +335,3 @@ def _placed(
             break
         share *= _NEARER
     return missing
-
-
-def _innermost(b: np.ndarray, c: np.ndarray) -> np.ndarray | None:
-    """The point (2,) of a ring of sides (K, 2) to (K, 2) that sees all of them, at the largest
-    distance from the nearest; None if there is none."""
-    middle, size = b.mean(axis=0), max(float(np.ptp(b, axis=0).max()), 1e-300)
-    b, side = (b - middle) / size, (c - b) / size
-    normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
-    length = np.linalg.norm(normal, axis=1).clip(1e-300)
-    normal /= length[:, None]
-    # n_k p - r >= h_k: the best r is met with equality by three of the sides
-    three = np.array(list(combinations(range(len(b)), 3)))
-    system = np.concatenate([normal, np.full((len(b), 1), -1.0)], axis=1)[three]
-    height = (normal * b).sum(axis=1)
-    good = np.abs(np.linalg.det(system)) > 1e-12
-    if not good.any():
-        return None
-    found = np.linalg.solve(system[good], height[three[good]][:, :, None])[:, :, 0]
-    slack = (found[:, :2] @ normal.T - height - found[:, 2:]).min(axis=1)
-    radius = np.where(slack >= -1e-9 * np.abs(found[:, 2]), found[:, 2], -np.inf)
-    best = int(radius.argmax())
-    if not radius[best] * size >= _LEAST_ROOM:
-        return None
-    return middle + size * found[best, :2]

@@ -16,7 +16,8 @@ import numpy as np
 
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE
-from nsm.domains.untangling import Copies, untangled
+from nsm.domains.reinsertion import turned_back
+from nsm.domains.untangling import Copies
 
 # coordinates of Ω are rounded to multiples of this; points above 64 to coarser ones
 _STEP, _DIGITS = SIDE * group.STEP, 52
@@ -65,8 +66,8 @@ def repaired(
 ) -> np.ndarray:
     """The image with flipped triangles turned back where possible, copies moving together.
 
-    See :func:`nsm.domains.untangling.untangled`: energy and Jacobians of triangles are the same in
-    all lifts, so that patches across copies and around cones need no unfolding.
+    See :func:`nsm.domains.reinsertion.turned_back`: energy and Jacobians of triangles are the same
+    in all lifts, so that patches across copies and around cones need no unfolding.
 
     Args:
         rest: (V, 2) the vertices in the plane, no triangle flipped.
@@ -79,10 +80,7 @@ def repaired(
     """
     image = copied(rest, pairs, image, even)
     copies = _copies(rest, pairs, image, even)
-    cones = _cones(rest, even)
-    for stay in (cones | held, cones):
-        image = untangled(rest, faces, image, stay, copies)
-    return image
+    return turned_back(rest, faces, image, _cones(rest, even), held, copies)
 
 
 def isotopy_class(

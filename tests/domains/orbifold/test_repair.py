@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from thorough import examples
 
-from nsm.domains import Orbifold, Surface, Torus
+from nsm.domains import Orbifold, Surface, Torus, reinsertion
 from nsm.domains.orbifold.repair import copied, isotopy_class, repaired, torn
 from nsm.domains.planar_mesh import flipped, signed_areas
 from nsm.surfaces import topology
@@ -125,6 +125,20 @@ def test_flips_at_copies_and_around_cones_are_turned_back(seed, kind):
     after = mended(surface, before)
     assert is_homeomorphism(surface, after)
     assert (after[fixed] == before[fixed]).all()
+
+
+@each
+def test_flips_at_copies_and_around_cones_are_turned_back_without_descent(kind, monkeypatch):
+    monkeypatch.setattr(reinsertion, "untangled", lambda rest, faces, image, *more: image)
+    surface = SURFACES[kind]
+    near = np.setdiff1d(np.unique(surface.seam_pairs[:, 0]), cones(surface))
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        hit = random.choice(near, 8, replace=False)
+        before = tangled(surface, random, hit, equivariant(surface, random, CLASSES[1]))
+        after = mended(surface, before)
+        assert flipped(before, surface.faces).any() and is_homeomorphism(surface, after)
+        assert (after[cones(surface)] == before[cones(surface)]).all()
 
 
 @given(seeds, kinds)
