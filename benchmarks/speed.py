@@ -529,8 +529,8 @@ def page(results: dict[str, Any]) -> str:
                 f"task={of} on {t['surface']}, on held-out points."
                 + (
                     f" The domain itself has distortion {t['param']['distortion_of_domain']:.3f}; "
-                    f"{LEAST_SYMMETRIC_DIRICHLET} is the least that is possible. Samples cannot flip; "
-                    "the triangles of flattenings that do are [counted](maps.md#measurements)."
+                    f"{LEAST_SYMMETRIC_DIRICHLET} is the least that is possible. Samples cannot "
+                    "flip; triangles of flattenings that do are [counted](maps.md#measurements)."
                     if of == "param"
                     else ""
                 ),
