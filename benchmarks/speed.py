@@ -530,7 +530,7 @@ def page(results: dict[str, Any]) -> str:
                 + (
                     f" The domain itself has distortion {t['param']['distortion_of_domain']:.3f}; "
                     f"{LEAST_SYMMETRIC_DIRICHLET} is the least that is possible. Samples cannot "
-                    "flip; flattened triangles that do are [counted](maps.md#measurements)."
+                    "flip; triangles of flattenings that do are [counted](maps.md#measurements)."
                     if of == "param"
                     else ""
                 ),
