@@ -336,7 +336,7 @@ class _Mesh:
             relax(uv, stars, Freedom.whole(len(uv)))
         here = self.copies.rounded(uv[:1])[0]
         if np.isfinite(here).all() and not star.turned(here):
-            self.place[v, 0] = at
+            self.place[v, 0] = here
 
     def _places(
         self, star: _Star, target: int, rest: np.ndarray, size: np.ndarray
