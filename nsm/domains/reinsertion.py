@@ -19,7 +19,7 @@ from nsm.domains.kernels import innermost
 from nsm.domains.planar_mesh import cross, flipped
 from nsm.domains.untangling import Copies, untangled
 from nsm.domains.vertex_relaxation import Freedom, Stars, relax
-from nsm.stages import counted
+from nsm.stages import at
 from nsm.surfaces.predicates import orientation
 
 _MOST = 5000  # vertices removed: it takes some milliseconds for each
@@ -64,7 +64,8 @@ def reinserted(
         return image
     copies = Copies.none(len(image)) if copies is None else copies
     mesh = _Mesh(rest, faces, image, fixed, copies)
-    removed = list(counted(f"{before} flips, vertices removed", list(mesh.without_flips())))
+    at(f"{before} flips, their vertices taken out")
+    removed = list(mesh.without_flips())
     moved = [one.vertex for one in reversed(removed) if mesh.put_back(one)]
     for _ in range(_SWEEPS):
         for v in moved:
@@ -122,13 +123,29 @@ class _Star:
         ring = set(self.b.tolist())
         return len(ring) == len(self.b) and ring == set(self.c.tolist())
 
-    def areas(self, at: np.ndarray, which: int) -> np.ndarray:
+    def areas(self, here: np.ndarray, which: int) -> np.ndarray:
         """Twice the signed areas (K,) with the vertex at (2,), in the image (0) or before (1)."""
-        return cross(self.of_b[:, which] - at, self.of_c[:, which] - at)
+        return cross(self.of_b[:, which] - here, self.of_c[:, which] - here)
 
-    def turned(self, at: np.ndarray) -> int:
+    def turned(self, here: np.ndarray) -> int:
         """How many triangles of the image are flipped with the vertex at (2,), exactly."""
-        return int((orientation(at, self.of_b[:, 0], self.of_c[:, 0]) <= 0).sum())
+        return int((orientation(here, self.of_b[:, 0], self.of_c[:, 0]) <= 0).sum())
+
+
+class _Around(dict[int, set[int]]):
+    """The faces around each of n vertices of a mesh (F, 3), looked up where they are asked for: of
+    a large mesh few vertices are."""
+
+    def __init__(self, faces: np.ndarray, n: int) -> None:
+        super().__init__()
+        corners = faces.ravel()
+        self.corner = np.argsort(corners, kind="stable")
+        self.start = np.searchsorted(corners[self.corner], np.arange(n + 1))
+
+    def __missing__(self, v: int) -> set[int]:
+        corners = self.corner[self.start[v] : self.start[v + 1]]
+        found = self[v] = set((corners // 3).tolist())
+        return found
 
 
 class _Mesh:
@@ -148,17 +165,13 @@ class _Mesh:
         sign = copies.sign[:, None]
         before = rest - sign * rest[copies.first]
         self.place = np.stack([image, rest], axis=1)
-        self.first_place = image
         self.copies = copies
         self.vertex = copies.first[faces]
         self.sign = copies.sign[faces]
         self.shift = np.stack([copies.shift, before], axis=1)[faces]
         self.held = np.zeros(len(image), dtype=bool)
         self.held[copies.first[fixed]] = True
-        self.around: list[set[int]] = [set() for _ in range(len(image))]
-        for f, corners in enumerate(self.vertex.tolist()):
-            for v in corners:
-                self.around[v].add(f)
+        self.around = _Around(self.vertex, len(image))
         self.bad = set(np.flatnonzero(flipped(image, faces)).tolist())
 
     def without_flips(self) -> Iterator[_Removed]:
@@ -229,17 +242,17 @@ class _Mesh:
             return
         ring = set(star.b.tolist())
         flips = len(self.bad & self.around[v])
-        for w, at in zip(star.b.tolist(), star.of_b, strict=True):
+        for w, here in zip(star.b.tolist(), star.of_b, strict=True):
             other = self._ring(w)
             common = ring & other
             if len(common) != 2 or any(len(self.around[u]) <= 3 for u in common):
                 continue
             stay = (star.b != w) & (star.c != w)
             b, c = star.of_b[stay], star.of_c[stay]
-            turned = [int((orientation(at[i], b[:, i], c[:, i]) <= 0).sum()) for i in range(2)]
+            turned = [int((orientation(here[i], b[:, i], c[:, i]) <= 0).sum()) for i in range(2)]
             if turned[0] > flips:
                 continue
-            sides = np.stack([b[:, 0] - at[0], c[:, 0] - at[0], c[:, 0] - b[:, 0]])
+            sides = np.stack([b[:, 0] - here[0], c[:, 0] - here[0], c[:, 0] - b[:, 0]])
             area = cross(sides[0], sides[1])
             shape = area / np.maximum((sides**2).sum(axis=2).max(axis=0), 1e-300)
             crowd = max(len(ring) + len(other) - 4, _CROWD) / _CROWD
@@ -268,8 +281,10 @@ class _Mesh:
         stay = np.array(sorted(self.around[v] - gone), dtype=np.int64)
         self.around[w].update(stay.tolist())
         self.bad -= self.around[v]
-        at = self.sign[stay][:, :, None] * self.place[self.vertex[stay], 0] + self.shift[stay, :, 0]
-        self.bad.update(stay[orientation(at[:, 0], at[:, 1], at[:, 2]) <= 0].tolist())
+        here = (
+            self.sign[stay][:, :, None] * self.place[self.vertex[stay], 0] + self.shift[stay, :, 0]
+        )
+        self.bad.update(stay[orientation(here[:, 0], here[:, 1], here[:, 2]) <= 0].tolist())
         self.around[v] = set()
         return _Removed(v, w, corners, sign, shift)
 
@@ -294,10 +309,10 @@ class _Mesh:
             least = _ROOM * size * max(float(now.sum()), 0.0) / float(size.sum())
             if (now > least).all() and not star.turned(own):
                 return False
-        for at in self._places(star, one.target, rest, size):
-            at = self.copies.rounded(at[None])[0]
-            if not star.turned(at):
-                self.place[v, 0] = at
+        for place in self._places(star, one.target, rest, size):
+            place = self.copies.rounded(place[None])[0]
+            if not star.turned(place):
+                self.place[v, 0] = place
                 return True
         return False
 
@@ -319,9 +334,9 @@ class _Mesh:
         with np.errstate(all="ignore"):
             stars = Stars.of(lifted, np.array([0]), np.zeros(n, dtype=np.int64), b, b + n)
             relax(uv, stars, Freedom.whole(len(uv)))
-        at = self.copies.rounded(uv[:1])[0]
-        if np.isfinite(at).all() and not star.turned(at):
-            self.place[v, 0] = at
+        here = self.copies.rounded(uv[:1])[0]
+        if np.isfinite(here).all() and not star.turned(here):
+            self.place[v, 0] = here
 
     def _places(
         self, star: _Star, target: int, rest: np.ndarray, size: np.ndarray
@@ -341,15 +356,15 @@ class _Mesh:
         inwards = np.stack([-sides[:, 1], sides[:, 0]], axis=1)
         lengths = np.linalg.norm(sides, axis=1)
         inwards = (inwards / np.maximum(lengths, 1e-300)[:, None]).sum(axis=0)
-        at = star.of_b[star.b == target, 0][0]
+        here = star.of_b[star.b == target, 0][0]
         for k in range(1, _TRIES):
-            yield at + _NEARER**k * lengths.min() * inwards
+            yield here + _NEARER**k * lengths.min() * inwards
 
 
-def _mean_value(at: np.ndarray, star: _Star) -> np.ndarray:
+def _mean_value(here: np.ndarray, star: _Star) -> np.ndarray:
     """The mean (2,) of a star's ring in the image, with the mean value weights (Floater 2003) that
     its vertex at (2,) has before the map."""
-    b, c = star.of_b[:, 1] - at, star.of_c[:, 1] - at
+    b, c = star.of_b[:, 1] - here, star.of_c[:, 1] - here
     lb, lc = np.linalg.norm(b, axis=1), np.linalg.norm(c, axis=1)
     half = np.abs(cross(b, c)) / np.maximum(lb * lc + (b * c).sum(axis=1), 1e-300)
     weight_b, weight_c = half / np.maximum(lb, 1e-300), half / np.maximum(lc, 1e-300)
