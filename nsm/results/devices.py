@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from pytorch_lightning.accelerators import CUDAAccelerator
 
 from nsm.errors import NsmError
 from nsm.wording import number_of
@@ -13,6 +12,8 @@ NO_GPU = "torch finds no GPU; give device=cpu, or install a driver and torch for
 
 def count_of_gpus() -> int:
     """How many GPUs of CUDA torch finds."""
+    from pytorch_lightning.accelerators import CUDAAccelerator  # seconds, which results need not
+
     # unlike torch's, Lightning's question for a GPU leaves the process fit for a fork
     return CUDAAccelerator.auto_device_count()
 

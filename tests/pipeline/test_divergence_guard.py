@@ -239,7 +239,7 @@ NETWORK = ["map.width=8", "map.depth=1"]
 SPLINES = {
     # ends in quasi-Newton steps
     "pair_map": ["map.cells=8", "constraints.triangles_from=0.8", "optimizer.iterations=4"],
-    "collection_map": ["map.cells=8", "constraints.triangles_from=0.9", "optimizer.iterations=2"],
+    "collection_map": ["map.cells=8", "constraints.triangles_from=0.9", "optimizer.iterations=6"],
     # has no others, and may end before its last step
     "param": ["map.cells=8", "optimizer.levels=[8]", "optimizer.steps=[]"],
 }
@@ -336,7 +336,8 @@ def test_a_map_killed_at_random_moments_ends_at_the_same_result(tmp_path, task):
             with Calls(last):
                 mapped(task, folder, resuming=folder.exists())
 
-        assert died(forked(work))
+        # calls are counted from a checkpoint on: none is written after the training's end
+        assert died(forked(work)) or steps == [20]
         steps.append(torch.load(folder / "last.ckpt", weights_only=True)["global_step"])
     assert 0 < steps[0] <= steps[1] <= 20
     assert same(mapped(task, folder, resuming=True), expected)
