@@ -51,6 +51,7 @@ class Stage:
         self.titles = [title] if title else []
         self.step, self.figures, self.done, self.total = "", "", 0, 0
         self.started = self.step_started = self.step_ended = time.monotonic()
+        self.last, self.pace = 1, 0.0  # steps between the last two reports, and seconds for each
         self._ended = threading.Event()
 
     def at(self, step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
@@ -58,7 +59,10 @@ class Stage:
         and figures that tell how it goes."""
         now = time.monotonic()
         if step != self.step or done < self.done:
-            self.step_started = now
+            self.step_started, self.last, self.pace = now, 1, 0.0
+        elif done > self.done:
+            self.last = done - self.done
+            self.pace = (now - self.step_ended) / self.last
         if done != self.done:
             self.step_ended = now
         self.step, self.done, self.total, self.figures = step, done, total, figures
@@ -69,9 +73,10 @@ class Stage:
         so_far = f"{now - self.started:.0f} s" if seconds else ""
         parts = [*self.titles, self.numbered_step(), so_far]
         if 0 < self.done < self.total:
-            # the step that is made may take longer than those before it
+            # steps may take longer from here on: so do those left, if two of them in turn did
             mean = (self.step_ended - self.step_started) / self.done
-            left = max(mean, now - self.step_ended) * (self.total - self.done)
+            slow = min(self.pace, (now - self.step_ended) / self.last)
+            left = max(mean, slow) * (self.total - self.done)
             parts.append(f"about {max(left, 1):.0f} s left")
         return "  ".join(part for part in (*parts, self.figures) if part)
 

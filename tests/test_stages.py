@@ -73,17 +73,34 @@ def test_parts_are_named_and_the_step_before_them_comes_back():
         assert not stages.showing()
 
 
-def test_a_step_that_takes_longer_than_those_before_it_is_awaited():
+def later(begun, seconds):
+    begun.step_started -= seconds
+    begun.step_ended -= seconds
+
+
+def test_steps_that_take_longer_than_those_before_them_are_awaited():
     begun = stages.Stage("work")
     begun.at("steps", 1, 4)
     begun.at("steps", 2, 4)
     begun.step_started -= 4  # two steps, two seconds each
-    begun.step_ended -= 0.1
     assert "about 4 s left" in begun.text()
-    begun.step_ended -= 30
-    assert "about 60 s left" in begun.text()
+    later(begun, 30)  # one slow step says nothing of the others
+    assert "about 4 s left" in begun.text()
+    begun.at("steps", 3, 4)
+    later(begun, 20)
+    assert "about 20 s left" in begun.text()
     begun.at("steps", 4, 4)
     assert "left" not in begun.text()
+
+
+def test_steps_that_are_reported_together_share_their_time():
+    begun = stages.Stage("work")
+    begun.at("faces", 0, 1000)
+    for done in (100, 200):
+        later(begun, 10)
+        begun.at("faces", done, 1000)
+    later(begun, 5)
+    assert "about 80 s left" in begun.text()
 
 
 def test_lines_keep_coming_however_long_it_lasts(often):
