@@ -213,14 +213,16 @@ def _overfit_config(config: DictConfig, on: Domain) -> DictConfig:
         f"seed={config.seed}",
         *(f"trainer.{key}={'null' if v is None else v}" for key, v in values.items()),
     ]
-    overfit = compose_config([*overrides, *config.phi.overrides])
     steps = config.phi.get("steps")  # absent in older run folders
     said = {word.lstrip("+").partition("=")[0] for word in config.phi.overrides}
-    if steps is not None and overfit.map.get("linear_skip") == "fitted":
-        if steps == 0 and not any(key.startswith(_OF_THE_FIT) for key in said):
-            overfit = compose_config([*overrides, "experiment=fit", *config.phi.overrides])
-        elif "trainer.max_steps" not in said:
-            overfit.trainer.max_steps = min(steps, overfit.trainer.max_steps)
+    alone = steps == 0 and not any(key.startswith(_OF_THE_FIT) for key in said)
+    fit = ["experiment=fit"] if alone else []
+    overfit = compose_config([*overrides, *fit, *config.phi.overrides])
+    fitted = overfit.map.get("linear_skip") == "fitted"
+    if alone and not fitted:  # a random start has to be trained
+        overfit = compose_config([*overrides, *config.phi.overrides])
+    elif fitted and steps is not None and "trainer.max_steps" not in said:
+        overfit.trainer.max_steps = min(steps, overfit.trainer.max_steps)
     with open_dict(overfit):
         overfit.domain = on.config
     return overfit
