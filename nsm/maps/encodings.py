@@ -187,12 +187,12 @@ class _Blend(torch.autograd.Function):
             tables: one for each of L levels, (rows, F).
         """
         turned = record and ctx.needs_input_grad[0]
-        levels, _, _, count = derivatives[0].shape
+        count = derivatives[0].shape[-1]
         # value, ∂u, ∂v, and for the gradient by x: ∂uu, ∂uv, ∂vv
         orders = [(0, 0), (1, 0), (0, 1), *([(2, 0), (1, 1), (0, 2)] if turned else [])]
         blend = torch.stack(
             [derivatives[i][:, 0, :, None] * derivatives[j][:, 1, None] for i, j in orders], dim=1
-        ).view(levels, len(orders), -1, count)
+        ).flatten(2, 3)
         rows = taps.transpose(1, 2)[:, None].expand(-1, len(orders), -1, -1)
         features = [
             nn.functional.embedding_bag(
@@ -200,7 +200,7 @@ class _Blend(torch.autograd.Function):
                 table,
                 mode="sum",
                 per_sample_weights=weight.transpose(1, 2).reshape(-1, weight.shape[1]),
-            ).view(len(orders), count, -1)
+            ).view(len(orders), count, table.shape[1])
             for row, weight, table in zip(rows, blend, tables, strict=True)
         ]
         out = torch.cat([f[:3] for f in features], dim=-1)
@@ -228,7 +228,7 @@ class _Blend(torch.autograd.Function):
         if blend is not None:
             # points innermost: long rows for the processor
             g = gradient.transpose(1, 2).contiguous()
-            g = g.view(3, len(ctx.shapes), 1, -1, gradient.shape[1])
+            g = g.view(3, len(ctx.shapes), 1, ctx.shapes[0][1], gradient.shape[1])
             shares = blend[:, 0, :, None] * g[0]
             for plane in (1, 2):
                 shares.addcmul_(blend[:, plane, :, None], g[plane])

@@ -5,7 +5,7 @@ import torch
 from map_samples import ACTIVATIONS, activation, network
 from torch.autograd.graph import saved_tensors_hooks
 
-from nsm.maps import BLOCKS, SplineGrid, mlp_with_tangents
+from nsm.maps import BLOCKS, LatticeSplineGrid, MultilevelSpline, SplineGrid, mlp_with_tangents
 
 
 def made(name: str, block: str, depth: int = 2, width: int = 5) -> torch.nn.Module:
@@ -144,6 +144,22 @@ def test_spline_grid_by_finite_differences(degree):
     stack = grid.value_and_jacobian_stack(x)
     torch.testing.assert_close(stack[0], grid(x))
     torch.testing.assert_close(stack[1:], tangents.permute(2, 0, 1))
+
+
+@pytest.mark.parametrize(
+    "grid", [SplineGrid(resolutions=[3, 5]), LatticeSplineGrid([[4, 8]]), MultilevelSpline(2, 8)]
+)
+def test_no_points_of_spline_grids(grid):
+    """As where an inversion has met all its targets."""
+    if isinstance(grid, MultilevelSpline):
+        value, jacobian = grid.value_and_jacobian(torch.zeros(0, 2))
+        assert value.shape == (0, 2) and jacobian.shape == (0, 2, 2)
+        jacobian.sum().backward()
+    else:
+        stack = grid.value_and_jacobian_stack(torch.zeros(0, 2))
+        assert stack.shape == (3, 0, grid.out_dim)
+        stack.sum().backward()
+    assert all(not p.grad.any() for p in grid.parameters())
 
 
 def test_frozen_spline_grid_keeps_derivatives_alone():
