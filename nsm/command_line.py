@@ -124,7 +124,8 @@ def accelerator(device: str) -> str:
 def _is_mesh(value: str) -> bool:
     from nsm.surfaces.loading import EXTENSIONS
 
-    known = (conf_folder() / "surface" / f"{value}.yaml").is_file()
+    # of os.path: a name too long for the disk is no file, and no error
+    known = os.path.isfile(conf_folder() / "surface" / f"{value}.yaml")
     return not known and ("/" in value or "\\" in value or Path(value).suffix.lower() in EXTENSIONS)
 
 

@@ -48,6 +48,13 @@ def test_tilde_is_the_home_folder(monkeypatch, tmp_path):
     assert prepared_overrides(["~optimizer"]) == ["~optimizer"]
 
 
+def test_paths_too_long_for_the_names_of_settings():
+    """The longest name that a disk takes is too long with what a setting's file adds."""
+    mesh = "m" * 251 + ".obj"
+    assert prepared_overrides([mesh]) == [f"surface.path={mesh}"]
+    assert prepared_overrides([f"source={mesh}"]) == [f"source={mesh}"]
+
+
 def test_a_task_and_its_surfaces(here, tmp_path):
     (tmp_path / "b (2).obj").touch()
     given = settings_of(here("--cfg", "job", "pair_map", "a.obj", "b (2).obj", "c.json", "seed=3"))
