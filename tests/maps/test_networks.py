@@ -95,6 +95,25 @@ def test_pre_activation_blocks_begin_as_identity():
     torch.testing.assert_close(deep(x), expected)
 
 
+def test_frozen_network_that_adds_nothing_is_left_out():
+    """As of a fit alone; what comes is what the whole network would give, gradients by x too."""
+    enc = encoding("SplineGrid", resolutions=[3, 5], features=2)
+    net = randomised(network(enc=enc, width=8, depth=1, linear_skip="linear"))
+    for parameter in net.output.parameters():
+        torch.nn.init.zeros_(parameter)
+    x = points(6).requires_grad_()
+    whole = (net(x), *net.value_and_jacobian(x))  # its weights could be trained
+    net.requires_grad_(False)
+    net.input.register_forward_hook(lambda *_: pytest.fail("it was evaluated"))
+    alone = (net(x), *net.value_and_jacobian(x))
+    for one, other in zip(alone, whole, strict=True):
+        torch.testing.assert_close(one, other)
+        gradients = (
+            torch.autograd.grad(y.square().sum(), x, retain_graph=True) for y in (one, other)
+        )
+        torch.testing.assert_close(*(g[0] for g in gradients))
+
+
 def test_siren_keeps_its_spread_with_depth():
     torch.manual_seed(0)
     net = NeuralMap(3, 256, 6, "plain", activation=Sine(), initialization="siren")
