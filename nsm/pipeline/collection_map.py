@@ -42,6 +42,7 @@ from nsm.results import (
     transfer_matrix_picture,
     warning_of_distortion,
     warning_of_faults,
+    warning_of_misfit,
     warning_of_missed_landmarks,
     warning_of_tears,
     write_correspondences,
@@ -270,6 +271,7 @@ class CollectionMapTask(Task):
         found = (
             None if self.proposed is None else self.proposed.warning,
             None if self.check is None else self.check.warning,
+            warning_of_misfit({phi.surface.name: phi.metrics for phi in self.phis}),
             warning_of_distortion(pairs),
             warning_of_missed_landmarks(pairs),
             *(warning_of_tears(name, of) for name, of in pairs.items()),

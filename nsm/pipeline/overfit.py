@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.text import Text
 
 from nsm.data import SurfaceData
 from nsm.domains import Surface
@@ -25,6 +26,7 @@ from nsm.results import (
     metrics_table,
     overfit_metrics,
     reconstruction_image,
+    warning_of_misfit,
 )
 from nsm.results.meshes import ColouredMesh, painted
 from nsm.results.metrics import evaluate
@@ -78,6 +80,10 @@ class OverfitTask(Task):
 
     def measure(self, result: NeuralSurface) -> None:
         result.metrics.update(overfit_metrics(result.surface, result.map))
+
+    def warnings(self, result: NeuralSurface) -> list[Text]:
+        misfit = warning_of_misfit({result.surface.name: result.metrics})
+        return [] if misfit is None else [misfit]
 
     def picture(self, module: Any) -> np.ndarray:
         return reconstruction_image(self.surface, module, size=384)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.text import Text
 
 from nsm.data import SurfaceData
 from nsm.domains import Surface
@@ -26,6 +27,7 @@ from nsm.results import (
     layout_image,
     parameterization_picture,
     planar_metrics,
+    warning_of_misfit,
 )
 from nsm.results.map_metrics import flipped_percent
 from nsm.results.meshes import ColouredMesh, painted
@@ -134,6 +136,12 @@ class ParamTask(Task):
             result.metrics["nsm"]["flipped_before_repair_percent"] = flipped_percent(
                 self.trained.uv, surface.faces, mirrored=True
             )
+
+    def warnings(self, result: Parameterization | ParameterizationAtlas) -> list[Text]:
+        misfit = warning_of_misfit(
+            {phi.surface.name: phi.metrics for phi in self.charts or [self.phi]}
+        )
+        return [] if misfit is None else [misfit]
 
     @property
     def _before(self) -> dict[str, np.ndarray]:

@@ -66,6 +66,9 @@ _MISSED = 5.0
 # percent of triangles folded before the repair from which on it is said: good maps have 0.4 at
 # most, those that landmarks pull to the wrong side of others 1 to 30
 _FOLDED = 1.0
+# percent of the diagonal by which φ may be off its mesh, RMS: fits are at 0.02, the shortest
+# trainings of small networks at 0.1 to 0.5
+_MISFIT = 1.0
 
 _PAIR_ROWS = {
     "symmetric_dirichlet_median": (
@@ -170,6 +173,24 @@ def warning_of_folds(maps: Mapping[str, Mapping[str, float]]) -> Text | None:
     )
 
 
+def warning_of_misfit(surfaces: Mapping[str, Mapping[str, float]]) -> Text | None:
+    """A line in red, if a neural surface is not near its mesh; None if all are.
+
+    Args:
+        surfaces: the figures of :func:`nsm.results.overfit_metrics` of each, by its name.
+    """
+    key = "rms_percent"
+    which, worst = _beyond(surfaces, key, _MISFIT, "surfaces")
+    if not which:
+        return None
+    return Text(
+        f"{which}: φ is {surfaces[worst][key]:.3g} % of the diagonal off the mesh (RMS): what is "
+        "made from it belongs to another surface. Train it longer, or begin with the fit, "
+        "initialization=fitted",
+        style="bold red",
+    )
+
+
 def warning_of_no_landmarks(name: str) -> Text:
     """A line for a map of meshes that nothing but its distortion has chosen.
 
@@ -184,13 +205,16 @@ def warning_of_no_landmarks(name: str) -> Text:
     )
 
 
-def _beyond(maps: Mapping[str, Mapping[str, float]], key: str, most: float) -> tuple[str, str]:
-    """Which maps have a figure above ``most``, in words, and the worst of them; "" for none."""
+def _beyond(
+    maps: Mapping[str, Mapping[str, float]], key: str, most: float, kind: str = "maps"
+) -> tuple[str, str]:
+    """Which maps, or others of a kind, have a figure above ``most``, in words, and the worst of
+    them; "" for none."""
     far = [name for name, of in maps.items() if of.get(key, 0.0) > most]
     if not far:
         return "", ""
     worst = max(far, key=lambda name: maps[name][key])
-    return worst if len(maps) == 1 else f"{len(far)} of {len(maps)} maps, {worst} most", worst
+    return worst if len(maps) == 1 else f"{len(far)} of {len(maps)} {kind}, {worst} most", worst
 
 
 _COLLECTION_COLUMNS = {

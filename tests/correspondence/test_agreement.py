@@ -14,6 +14,7 @@ from nsm.pipeline.landmark_check import check_landmarks
 from nsm.results import (
     warning_of_distortion,
     warning_of_folds,
+    warning_of_misfit,
     warning_of_missed_landmarks,
 )
 from nsm.results.report.runs import find_runs
@@ -160,6 +161,12 @@ def test_a_missed_landmark_is_told():
     assert warning_of_missed_landmarks({"a → b": {**off, "landmark_error_max_percent": 1}}) is None
     said = warning_of_missed_landmarks({"a → b": {}, "b → a": off}).plain
     assert "1 of 2 maps, b → a most" in said and "40.0 %" in said and "11.0 %" in said
+
+
+def test_a_surface_that_is_not_near_its_mesh_is_told():
+    assert warning_of_misfit({"a": {}, "b": {"rms_percent": 0.02}}) is None
+    said = warning_of_misfit({"a": {"rms_percent": 0.02}, "b": {"rms_percent": 24.0}}).plain
+    assert said.startswith("1 of 2 surfaces, b most: φ is 24 % of the diagonal off the mesh")
 
 
 def test_folds_before_the_repair_are_told_from_one_percent_on():

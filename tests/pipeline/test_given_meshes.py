@@ -25,6 +25,19 @@ def test_overfit_takes_arrays_as_it_takes_their_surface(patch, capfd):
     assert one.metrics["rms_percent"] == pytest.approx(other.metrics["rms_percent"])
 
 
+def test_a_surface_that_has_not_come_near_its_mesh_says_so(patch, tmp_path, capfd):
+    """In what is printed, and where figures are kept; so does a flattening that is made from it."""
+    far = [*TINY, "initialization=random", "trainer.max_steps=1"]
+    phi = nsm.overfit(patch, overrides=far, folder=tmp_path / "far")
+    assert phi.metrics["rms_percent"] > 1
+    assert "% of the diagonal off the mesh" in capfd.readouterr().out
+    assert "off the mesh" in (tmp_path / "far" / "metrics.json").read_text()
+
+    words = [word for word in TINY if not word.startswith("encoding")]
+    nsm.parameterize(phi, overrides=words)
+    assert "% of the diagonal off the mesh" in capfd.readouterr().out
+
+
 def test_parameterize_and_map_pair_take_arrays_and_surfaces(patch, capfd):
     words = [*TINY, "phi.overrides=[" + ",".join(f"'{word}'" for word in TINY) + "]"]
     words = [word for word in words if not word.startswith("encoding")]  # h is a spline
