@@ -2,7 +2,7 @@
 
 Figures that are there are kept, so that an interrupted run continues where it stopped:
 
-    python benchmarks/closed_maps.py --meshes FOLDER [--only CASE ...]
+    python benchmarks/closed_maps.py --meshes FOLDER [--only CASE ...] [--again WAY ...]
 
 A pair is mapped with the default training, with experiment=fast and with experiment=adam, first
 all on their closed domain. Seconds are the CPU time of a map on one thread, from trained surfaces,
@@ -247,16 +247,21 @@ def _figures_of(found: dict[str, Any], domain: str, way: str) -> dict[str, Any]:
 
 
 def measure(
-    name: str, closed: str, domain: str, run: Callable[[str, Sequence[str]], dict[str, Any]]
+    name: str,
+    closed: str,
+    domain: str,
+    run: Callable[[str, Sequence[str]], dict[str, Any]],
+    again: Sequence[str] = (),
 ) -> None:
-    """What is missing of a case on a domain, into its file."""
+    """What is missing of a case on a domain, or only some ways again, into its file."""
     file = RESULTS / f"{name.replace(' ', '_')}.json"
     about = {"torch": torch.__version__, "machine": platform.machine()}
     found: dict[str, Any] = {"case": name, "closed_domain": closed, **about}
     if file.exists():
         found = json.loads(file.read_text())
     known = found.setdefault(domain, {})
-    wanted = [way for way in (OF_COLLECTION if name == "collection" else WAYS) if way not in known]
+    every = OF_COLLECTION if name == "collection" else WAYS
+    wanted = [way for way in every if (way in again if again else way not in known)]
     if wanted:
         print(name, domain, *wanted, flush=True)
         known |= run(domain, wanted)
@@ -267,6 +272,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", type=Path, default=Path("../shared/meshes"))
     parser.add_argument("--only", nargs="*", help="cases to run; all by default")
+    parser.add_argument("--again", nargs="*", default=(), choices=WAYS, help="measure these again")
     arguments = parser.parse_args()
     if not arguments.meshes.is_dir():
         parser.error(f"{arguments.meshes}: no such folder; give one with --meshes")
@@ -275,7 +281,7 @@ def main() -> None:
         for on in ("closed", "disc"):
             for name, (closed, run) in cases(arguments.meshes, Path(scratch)).items():
                 if not arguments.only or name in arguments.only:
-                    measure(name, closed, closed if on == "closed" else on, run)
+                    measure(name, closed, closed if on == "closed" else on, run, arguments.again)
     text = tables()
     (RESULTS.parent / "closed_maps.md").write_text(text)
     print(text)
