@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -101,16 +102,23 @@ def _margin(kept: list[Hypothesis]) -> float:
 def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypothesis]:
     """Hypotheses, best first, those that are nearly as good as the first in the order of finer
     maps."""
-    first = kept[0].score
-    near = [h for h in kept if h.score <= first + LEAST_MARGIN]
+    near = [h for h in kept if h.score <= kept[0].score + LEAST_MARGIN]
     at("finer maps")
-    scores = finer_scores(meshes, [h.candidate for h in near], [h.vertices for h in near])
-    if not np.isfinite(scores).all():
-        return kept
-    scores = first + scores - scores.min()
+    scores = told_apart(near, meshes)
     better = [replace(h, score=float(value)) for h, value in zip(near, scores, strict=True)]
     others = [h for h in kept if all(h is not one for one in near)]
     return sorted([*better, *others], key=lambda h: h.score)
+
+
+def told_apart(near: Sequence[Hypothesis], meshes: tuple[Mesh, Mesh]) -> np.ndarray:
+    """The scores (H,) of hypotheses that hardly differ: the best one's, and by how much finer maps
+    of the meshes are behind the best of these.
+
+    They stay as they are where finer maps cannot be compared.
+    """
+    own = np.array([h.score for h in near])
+    scores = finer_scores(meshes, [h.candidate for h in near], [h.vertices for h in near])
+    return own.min() + scores - scores.min() if np.isfinite(scores).all() else own
 
 
 def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:
