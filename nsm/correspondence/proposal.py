@@ -9,6 +9,7 @@ import numpy as np
 
 from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
 from nsm.correspondence.finer_maps import Mesh, finer_scores
+from nsm.correspondence.further_ends import further_ends
 from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
@@ -30,11 +31,13 @@ class Hypothesis:
 
     Attributes:
         vertices: (L, 2) corresponding vertices of source and target: landmarks that were given;
-            tips that the map brings near to each other; cones of the orbifold that are no tips,
-            only where the others are fewer than four.
+            tips that the map brings near to each other, of fewer than five given ones; cones of the
+            orbifold that are no tips, only where the others are fewer than four; of the best map,
+            if it is sure, further ends of limbs.
         score: of the coarse map; lower is better. Of those that hardly differ, the best has the
             best score, and the others are as far behind as finer maps are.
-        whole: whether all tips of one shape go to tips of the other.
+        whole: whether all tips of one shape go to tips of the other; not asked where five landmarks
+            or more were given.
         candidate: the coarse map.
     """
 
@@ -90,13 +93,28 @@ def proposed(
     shapes = [coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)]
     kept = hypotheses(*shapes)
     margin = _margin(kept)
-    if margin <= LEAST_MARGIN and len(given) < COMMON:
+    if len(given) >= COMMON:
+        # these tell where the map goes: limbs that are left say nothing against it
+        kept[0] = replace(kept[0], vertices=given, whole=True)
+    elif margin <= LEAST_MARGIN:
         kept = _told_apart(kept, meshes)
-    return Proposal(kept, min(margin, _margin(kept)), len(given))
+    found = Proposal(kept, min(margin, _margin(kept)), len(given))
+    if found.sure and len(kept[0].vertices) >= COMMON:
+        kept[0] = _completed(kept[0], meshes)
+    return found
 
 
 def _margin(kept: list[Hypothesis]) -> float:
     return kept[1].score - kept[0].score if len(kept) > 1 else np.inf
+
+
+def _completed(best: Hypothesis, meshes: tuple[Mesh, Mesh]) -> Hypothesis:
+    """The hypothesis with those ends of limbs that a map through its landmarks meets at little
+    cost."""
+    at("ends of limbs")
+    return replace(
+        best, vertices=np.concatenate([best.vertices, further_ends(meshes, best.vertices)])
+    )
 
 
 def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypothesis]:

@@ -10,6 +10,7 @@ from limbs import LIMBS, star
 from nsm.correspondence import (
     collection_proposal,
     finer_maps,
+    further_ends,
     proposal,
     proposed,
     proposed_for_all,
@@ -59,6 +60,9 @@ def quicken(monkeypatch):
     monkeypatch.setattr(search, "_TARGET_SETS", 6)
     monkeypatch.setattr(proposal, "candidates", lambda s, t: search.candidates(s, t, rounds))
     monkeypatch.setattr(proposal, "MENDING", ())
+    monkeypatch.setattr(further_ends, "FACES", 1000)
+    monkeypatch.setattr(further_ends, "ROUND", Round(0, 5, 30))
+    monkeypatch.setattr(further_ends, "DRAWN", Round(0, 6, 30))
     monkeypatch.setattr(finer_maps, "FACES", 1200)
     monkeypatch.setattr(finer_maps, "ROUNDS", (Round(0, 4, 15), Round(0, 6, 15)))
 
@@ -214,6 +218,9 @@ def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch
     """Three limbs have landmarks; two landmarks lie between limbs; two limbs are left."""
     monkeypatch.setattr(proposal, "MENDING", (Round(4, 8, 30),))
     monkeypatch.setattr(search, "_THROUGH", Round(8, 5, 60))
+    monkeypatch.setattr(further_ends, "FACES", 1000)
+    monkeypatch.setattr(further_ends, "ROUND", Round(0, 5, 40))
+    monkeypatch.setattr(further_ends, "DRAWN", Round(0, 6, 30))
     source, target, tips = pair
     between = np.abs(np.linalg.norm(source[0], axis=1) - 1).argsort()[[0, 40]]
     ours = np.concatenate([tips[0][:3], between])
@@ -229,6 +236,11 @@ def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch
         assert limb.argmin() == its.argmin()
         left.add(int(limb.argmin()))
     assert left == {3, 4}
+    # where the map is far from an isometry, they are kept as they are
+    monkeypatch.setattr(proposal, "LARGEST_SCORE", 0.1)
+    monkeypatch.setattr(proposal, "further_ends", None)
+    found = proposed(source, target, given)
+    assert not found.sure and found.hypotheses[0].vertices.tolist() == given.tolist()
 
 
 def test_finer_maps_tell_the_right_one_of_two_that_hardly_differ(
