@@ -34,16 +34,16 @@ Pair = tuple[int, int]
 def further_ends(meshes: tuple[Mesh, Mesh], known: np.ndarray) -> np.ndarray:
     """Corresponding ends of limbs, as vertices (L, 2) of two closed meshes of genus 0.
 
-    Ends may correspond where a map through known landmarks brings them near to each other.
-    Maps that meet as many of them as can be met at little cost are compared by their scores. An end
-    stays alone where another one would do as well.
+    Ends may correspond where a map through the known landmarks brings them near to each other. Of
+    all sets of such pairs the largest is taken through which a map has a score that is hardly
+    higher. An end stays alone where another one would do as well.
 
     Args:
         meshes: vertices (V, 3) and faces (F, 3) of source and target.
         known: (G, 2) landmarks, five or more; ends near them are left out.
 
     Raises:
-        NsmError: as :func:`nsm.correspondence.search.through_four`.
+        NsmError: ``not_injective``, as :func:`nsm.correspondence.search.through_four`.
     """
     ends, heights = zip(*(_ends(mesh, known[:, k]) for k, mesh in enumerate(meshes)), strict=True)
     if not all(map(len, ends)):
@@ -59,10 +59,7 @@ def further_ends(meshes: tuple[Mesh, Mesh], known: np.ndarray) -> np.ndarray:
     tried = [[], *_matchings(apart, *heights)]
     drawn = [np.concatenate([held, _vertices(source, target, pairs)]) for pairs in tried]
     scores = np.array([score(one) for one in trained([best] * len(tried), DRAWN, drawn=drawn)])
-    count = np.array([len(pairs) for pairs in tried])
-    possible = scores <= scores[0] + _COST * count
-    largest = possible & (count == count[possible].max())
-    taken = tried[int(np.where(largest, scores, np.inf).argmin())]
+    taken = _largest(tried, scores)
     return np.array([(ends[0][i], ends[1][j]) for i, j in taken], dtype=np.int64).reshape(-1, 2)
 
 
@@ -81,6 +78,15 @@ def _of(shape: CoarseShape) -> np.ndarray:
 def _vertices(source: CoarseShape, target: CoarseShape, pairs: Sequence[Pair]) -> np.ndarray:
     numbers = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     return np.stack([_of(source)[numbers[:, 0]], _of(target)[numbers[:, 1]]], axis=1)
+
+
+def _largest(tried: Sequence[list[Pair]], scores: np.ndarray) -> list[Pair]:
+    """The largest set that is worth its score (N,), and of several the one with the lowest; the
+    first one is empty."""
+    count = np.array([len(pairs) for pairs in tried])
+    possible = scores <= scores[0] + _COST * count
+    largest = possible & (count == count[possible].max())
+    return tried[int(np.where(largest, scores, np.inf).argmin())]
 
 
 def _matchings(apart: np.ndarray, ours: np.ndarray, theirs: np.ndarray) -> list[list[Pair]]:

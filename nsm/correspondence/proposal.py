@@ -13,6 +13,7 @@ from nsm.correspondence.further_ends import further_ends
 from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
+from nsm.errors import NsmError
 from nsm.stages import at, counted
 
 # two maps differ if their images are this far apart in the mean, over √area, or if they take an end
@@ -110,11 +111,13 @@ def _margin(kept: list[Hypothesis]) -> float:
 
 def _completed(best: Hypothesis, meshes: tuple[Mesh, Mesh]) -> Hypothesis:
     """The hypothesis with those ends of limbs that a map through its landmarks meets at little
-    cost."""
+    cost; without them where the finer shapes have no layout."""
     at("ends of limbs")
-    return replace(
-        best, vertices=np.concatenate([best.vertices, further_ends(meshes, best.vertices)])
-    )
+    try:
+        more = further_ends(meshes, best.vertices)
+    except NsmError:
+        return best
+    return replace(best, vertices=np.concatenate([best.vertices, more]))
 
 
 def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypothesis]:

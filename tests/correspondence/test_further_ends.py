@@ -19,12 +19,12 @@ def shapes():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(module, "FACES", 1000)
-    monkeypatch.setattr(module, "ROUND", Round(0, 5, 40))
-    monkeypatch.setattr(module, "DRAWN", Round(0, 6, 30))
+    monkeypatch.setattr(module, "FACES", 800)
+    monkeypatch.setattr(module, "ROUND", Round(0, 4, 30))
+    monkeypatch.setattr(module, "DRAWN", Round(0, 5, 20))
 
 
-def test_limbs_without_a_landmark_are_matched(shapes, quick, monkeypatch):
+def test_limbs_without_a_landmark_are_matched(shapes, quick):
     source, target, tips = shapes
     between = np.abs(np.linalg.norm(source[0], axis=1) - 1).argsort()[[0, 40]]
     given = np.repeat(np.concatenate([tips[:3], between])[:, None], 2, axis=1)
@@ -37,8 +37,14 @@ def test_limbs_without_a_landmark_are_matched(shapes, quick, monkeypatch):
         apart.argmin(axis=1)
         == np.linalg.norm(source[0][tips[3:], None] - source[0][pairs[:, 0]], axis=2).argmin(axis=1)
     ).all()
-    monkeypatch.setattr(module, "_COST", -10.0)  # none is worth its cost
-    assert further_ends((source, target), given).shape == (0, 2)
+
+
+def test_the_largest_set_that_is_worth_its_cost_is_taken():
+    one, two, other = [(0, 0)], [(0, 0), (1, 1)], [(0, 1), (1, 0)]
+    tried = [[], two, other, one]
+    assert module._largest(tried, np.array([2.0, 2.09, 2.08, 1.9])) == other
+    assert module._largest(tried, np.array([2.0, 2.12, 2.3, 2.04])) == one
+    assert module._largest(tried, np.array([2.0, 2.12, 2.3, 2.06])) == []
 
 
 def test_nothing_is_added_where_all_limbs_have_landmarks(shapes, monkeypatch):
