@@ -26,6 +26,7 @@ _SAME = 0.1  # of an end to a known landmark, over √area
 _FAR = 0.35  # of an end's image to the end that may correspond to it, over √area
 _RIVAL, _AS_LARGE = 1.2, 0.8  # ends that are nearly as near, and nearly as large
 _COST = 0.05  # by which the score may rise for each pair of ends
+_AHEAD = 0.03  # by which it must be lower than that of as many other pairs
 _PAIRS, _TRIED = 10, 48  # of which matchings are made, and how many are tried
 
 Pair = tuple[int, int]
@@ -36,7 +37,7 @@ def further_ends(meshes: tuple[Mesh, Mesh], known: np.ndarray) -> np.ndarray:
 
     Ends may correspond where a map through the known landmarks brings them near to each other. Of
     all sets of such pairs the largest is taken through which a map has a score that is hardly
-    higher. An end stays alone where another one would do as well.
+    higher. An end stays alone where another one would do as well, or nearly as well.
 
     Args:
         meshes: vertices (V, 3) and faces (F, 3) of source and target.
@@ -81,12 +82,13 @@ def _vertices(source: CoarseShape, target: CoarseShape, pairs: Sequence[Pair]) -
 
 
 def _largest(tried: Sequence[list[Pair]], scores: np.ndarray) -> list[Pair]:
-    """The largest set that is worth its score (N,), and of several the one with the lowest; the
-    first one is empty."""
+    """The pairs of the largest set that is worth its score (N,): of several those that are in all
+    of the nearly best ones. The first set is empty."""
     count = np.array([len(pairs) for pairs in tried])
     possible = scores <= scores[0] + _COST * count
     largest = possible & (count == count[possible].max())
-    return tried[int(np.where(largest, scores, np.inf).argmin())]
+    best = largest & (scores <= scores[largest].min() + _AHEAD)
+    return sorted(set.intersection(*(set(tried[k]) for k in np.flatnonzero(best).tolist())))
 
 
 def _matchings(apart: np.ndarray, ours: np.ndarray, theirs: np.ndarray) -> list[list[Pair]]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
+from nsm.correspondence.distances import edge_distances
 from nsm.correspondence.finer_maps import Mesh, finer_scores
 from nsm.correspondence.further_ends import further_ends
 from nsm.correspondence.mending import MENDING, mended
@@ -15,6 +16,7 @@ from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
 from nsm.errors import NsmError
 from nsm.stages import at, counted
+from nsm.surfaces import topology
 
 # two maps differ if their images are this far apart in the mean, over √area, or if they take an end
 # of a limb to ends of two limbs
@@ -32,9 +34,9 @@ class Hypothesis:
 
     Attributes:
         vertices: (L, 2) corresponding vertices of source and target: landmarks that were given;
-            tips that the map brings near to each other, of fewer than five given ones; cones of the
-            orbifold that are no tips, only where the others are fewer than four; of the best map,
-            if it is sure, further ends of limbs.
+            of the best map, if it is sure, ends of limbs (:mod:`nsm.correspondence.further_ends`);
+            tips that the map brings near to each other; cones of the orbifold that are no tips,
+            only where the others are fewer than four.
         score: of the coarse map; lower is better. Of those that hardly differ, the best has the
             best score, and the others are as far behind as finer maps are.
         whole: whether all tips of one shape go to tips of the other; not asked where five landmarks
@@ -96,12 +98,12 @@ def proposed(
     margin = _margin(kept)
     if len(given) >= COMMON:
         # these tell where the map goes: limbs that are left say nothing against it
-        kept[0] = replace(kept[0], vertices=given, whole=True)
+        kept[0] = replace(kept[0], whole=True)
     elif margin <= LEAST_MARGIN:
         kept = _told_apart(kept, meshes)
     found = Proposal(kept, min(margin, _margin(kept)), len(given))
     if found.sure and len(kept[0].vertices) >= COMMON:
-        kept[0] = _completed(kept[0], meshes)
+        kept[0] = _completed(kept[0], given, meshes)
     return found
 
 
@@ -109,15 +111,25 @@ def _margin(kept: list[Hypothesis]) -> float:
     return kept[1].score - kept[0].score if len(kept) > 1 else np.inf
 
 
-def _completed(best: Hypothesis, meshes: tuple[Mesh, Mesh]) -> Hypothesis:
+def _completed(best: Hypothesis, given: np.ndarray, meshes: tuple[Mesh, Mesh]) -> Hypothesis:
     """The hypothesis with those ends of limbs that a map through its landmarks meets at little
-    cost; without them where the finer shapes have no layout."""
+    cost; without them where the finer shapes have no layout.
+
+    Given landmarks, if they are five or more, decide alone; tips come after the ends.
+    """
     at("ends of limbs")
+    known = given if len(given) >= COMMON else best.vertices
     try:
-        more = further_ends(meshes, best.vertices)
+        more = further_ends(meshes, known)
     except NsmError:
         return best
-    return replace(best, vertices=np.concatenate([best.vertices, more]))
+    tips = best.vertices[len(known) :]
+    for k, (vertices, faces) in enumerate(meshes):
+        if len(more) and len(tips):
+            apart = edge_distances(vertices, faces, more[:, k])[:, tips[:, k]].min(axis=0)
+            area = topology.face_areas(vertices, faces).sum()
+            tips = tips[apart > _NEAR * np.sqrt(area)]
+    return replace(best, vertices=np.concatenate([known, more, tips]))
 
 
 def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypothesis]:

@@ -42,9 +42,13 @@ def test_limbs_without_a_landmark_are_matched(shapes, quick):
 def test_the_largest_set_that_is_worth_its_cost_is_taken():
     one, two, other = [(0, 0)], [(0, 0), (1, 1)], [(0, 1), (1, 0)]
     tried = [[], two, other, one]
-    assert module._largest(tried, np.array([2.0, 2.09, 2.08, 1.9])) == other
+    assert module._largest(tried, np.array([2.0, 2.09, 2.05, 1.9])) == other
     assert module._largest(tried, np.array([2.0, 2.12, 2.3, 2.04])) == one
     assert module._largest(tried, np.array([2.0, 2.12, 2.3, 2.06])) == []
+    # of two that are nearly as good, what both have
+    assert module._largest(tried, np.array([2.0, 2.05, 2.06, 1.9])) == []
+    tried = [[], two, [(0, 0), (2, 1)]]
+    assert module._largest(tried, np.array([2.0, 2.05, 2.06])) == one
 
 
 def test_nothing_is_added_where_all_limbs_have_landmarks(shapes, monkeypatch):

@@ -236,11 +236,10 @@ def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch
         assert limb.argmin() == its.argmin()
         left.add(int(limb.argmin()))
     assert left == {3, 4}
-    # where the map is far from an isometry, they are kept as they are
+    # where the map is far from an isometry, no ends are looked for
     monkeypatch.setattr(proposal, "LARGEST_SCORE", 0.1)
     monkeypatch.setattr(proposal, "further_ends", None)
-    found = proposed(source, target, given)
-    assert not found.sure and found.hypotheses[0].vertices.tolist() == given.tolist()
+    assert not proposed(source, target, given).sure
 
 
 def test_finer_maps_tell_the_right_one_of_two_that_hardly_differ(
