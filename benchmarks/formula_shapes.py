@@ -3,7 +3,8 @@
 A solid is the smooth union of limbs (chains of capsules) and ellipsoids. Its surface is the zero
 set of the distance, by marching cubes, on about 4,000 triangles. Landmarks are where rays from
 within leave the solid, such as at the end of a limb, and correspond by their order.
-``made(name, pose)`` gives one shape.
+``made(name, pose)`` gives one shape; ``symmetries`` the other orders in which landmarks correspond
+as well.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 
 import igl
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from nsm.domains.orbifold.cones import decimated
 from nsm.surfaces.topology import face_components, renumbered
@@ -375,6 +377,8 @@ CLOSED = dict(
 # open along its rim, and with a hole in its side
 OPEN: dict[str, Callable[[int], Solid]] = {"vase": vase}
 NAMES = (*CLOSED, *OPEN, "face")
+# rotations that take the first pose to itself, by axis and order; limbs bend in the second one
+ROTATIONS = {"octopus": (Z, 8), "table": (Z, 2), "pliers": (Y, 2)}
 
 
 def made(name: str, pose: int, faces: int = FACES) -> Shape:
@@ -395,6 +399,21 @@ def made(name: str, pose: int, faces: int = FACES) -> Shape:
         x, triangles = x[used], local[triangles]
     ends = np.array([_end(solid, *ray) for ray in (*solid.given, *solid.others)])
     return _finished(x, triangles, ends, len(solid.given), faces)
+
+
+def symmetries(name: str) -> list[np.ndarray]:
+    """Orders (L,) of the landmarks of a class, one for each rotation of the first pose to itself;
+    the order in which they are comes first."""
+    shape = made(name, 0)
+    places = shape.vertices[shape.landmarks]
+    axis, order = ROTATIONS.get(name, (Z, 1))
+    return [
+        np.linalg.norm(
+            Rotation.from_rotvec(2 * np.pi * k / order * axis).apply(places)[:, None] - places,
+            axis=2,
+        ).argmin(axis=1)
+        for k in range(order)
+    ]
 
 
 def _zero_set(solid: Distance, cells: int) -> tuple[np.ndarray, np.ndarray]:

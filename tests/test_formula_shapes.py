@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nsm.correspondence.distances import edge_distances
 from nsm.surfaces.topology import genus_and_boundary
 from nsm.surfaces.validation import clean
 
@@ -42,3 +43,15 @@ def test_a_landmark_is_where_its_ray_leaves_the_solid(shapes):
     assert shapes._end(solid, np.zeros(3), np.array([0, 0.5, 0])) == pytest.approx(
         [0, 0.5, 0], abs=1e-3
     )
+
+
+@pytest.mark.parametrize(("name", "order"), {"octopus": 8, "pliers": 2, "fish": 1}.items())
+def test_rotations_of_a_shape_to_itself_exchange_landmarks(shapes, name, order):
+    orders = shapes.symmetries(name)
+    assert len({tuple(one.tolist()) for one in orders}) == len(orders) == order
+    shape = shapes.made(name, 0)
+    apart = edge_distances(shape.vertices, shape.faces, shape.landmarks)[:, shape.landmarks]
+    for one in orders:
+        assert sorted(one.tolist()) == list(range(len(one)))
+        assert apart[np.ix_(one, one)] == pytest.approx(apart, abs=0.15)
+    assert orders[0].tolist() == list(range(len(orders[0])))

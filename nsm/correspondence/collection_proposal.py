@@ -2,7 +2,7 @@
 
 Every surface is matched with a hub. Which of the hypotheses are taken is decided for all surfaces
 together: two maps from the hub also make one between their targets, which has its own change of
-distances and its own rigid residual.
+distances and its own rigid residual. Near ties of a member's maps are decided by finer maps.
 """
 
 from __future__ import annotations
@@ -13,21 +13,20 @@ from itertools import combinations
 
 import numpy as np
 
-from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
+from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
+from nsm.correspondence.joint_choice import Way, ways
 from nsm.correspondence.layouts import quick_scores
 from nsm.correspondence.proposal import (
     LEAST_LANDMARKS,
     LEAST_MARGIN,
     Hypothesis,
     hypotheses,
+    told_apart,
 )
 from nsm.correspondence.scores import compared
+from nsm.stages import counted
 
 _KEPT = 5
-
-Choice = dict[int, int]  # of each member the number of its hypothesis
-Scores = dict[int, np.ndarray]  # (H,) of each member
-PairScores = dict[tuple[int, int], np.ndarray]  # (H, H') of two members
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,8 @@ class CollectionProposal:
         vertices: of each hypothesis (L, k) corresponding vertices, best first; the given ones
             before others.
         scores: (H,) mean of the members' scores and of those of the maps between them.
-        margin: by how much the score of a member rises if another of its hypotheses is taken.
+        margin: by how much the total of the scores rises, for each member that changes, if another
+            hypothesis of one is taken; or less, if it was less before finer maps were compared.
         given: how many landmarks were given.
         sure: whether all members are far ahead, and good in themselves.
     """
@@ -73,24 +73,44 @@ def proposed_for_all(
         (i, j): np.array([[_between(g, h) for h in found[j]] for g in found[i]]) / (k - 2)
         for i, j in combinations(others, 2)
     }
-    chosen = _least(own, between)
-    best = _total(own, between, chosen)
-    changed = []
-    for i in others:
-        for other in range(len(own[i])):
-            if other != chosen[i]:
-                way = {**chosen, i: other}
-                changed.append((_total(own, between, way) - best, way))
-    changed.sort(key=lambda entry: entry[0])
-    ways = [chosen, *(way for _, way in changed[: _KEPT - 1])]
-    margin = changed[0][0] if changed else np.inf
+    found_ways = ways(own, between)
+    margin = _margin(found_ways)
+    if margin <= LEAST_MARGIN and len(fixed) < COMMON:
+        for i, numbers in counted("finer maps", list(_near(found_ways).items())):
+            tied = [found[i][n] for n in numbers]
+            own[i][numbers] = told_apart(tied, (meshes[hub], meshes[i]))
+        found_ways = ways(own, between)
+        margin = min(margin, _margin(found_ways))
+    best = found_ways[0]
+    kept = [best, *_different(found_ways[1:])][:_KEPT]
     return CollectionProposal(
-        [_landmarks(shapes, hub, {i: found[i][n] for i, n in way.items()}) for way in ways],
-        [(best + rise) / len(others) for rise in (0.0, *(r for r, _ in changed[: _KEPT - 1]))],
-        float(margin),
+        [_landmarks(shapes, hub, {i: found[i][n] for i, n in way.choice.items()}) for way in kept],
+        [way.total / len(others) for way in kept],
+        margin,
         len(fixed),
-        bool(margin > LEAST_MARGIN and all(found[i][n].good for i, n in chosen.items())),
+        bool(margin > LEAST_MARGIN and all(found[i][n].good for i, n in best.choice.items())),
     )
+
+
+def _margin(found: Sequence[Way]) -> float:
+    return found[1].behind if len(found) > 1 else np.inf
+
+
+def _near(found: Sequence[Way]) -> dict[int, list[int]]:
+    """Of members with near ties the numbers of the hypotheses that are nearly as good as the one
+    taken, this one included."""
+    near: dict[int, list[int]] = {}
+    for way in found[1:]:
+        if way.behind <= LEAST_MARGIN:
+            i, n = way.turned
+            near.setdefault(i, [found[0].choice[i]]).append(n)
+    return near
+
+
+def _different(found: Sequence[Way]) -> list[Way]:
+    """Ways with different choices, least total first."""
+    of_choice = {tuple(sorted(way.choice.items())): way for way in found}
+    return sorted(of_choice.values(), key=lambda way: way.total)
 
 
 def hub_of(shapes: Sequence[CoarseShape]) -> int:
@@ -103,25 +123,6 @@ def _between(first: Hypothesis, second: Hypothesis) -> float:
     a, b = first.candidate, second.candidate
     samples = a.source.shape.samples
     return compared(a.target.shape, a.images(samples), b.target.shape, b.images(samples))
-
-
-def _total(
-    own: dict[int, np.ndarray], between: dict[tuple[int, int], np.ndarray], c: Choice
-) -> float:
-    alone = sum(float(scores[c[i]]) for i, scores in own.items())
-    return alone + sum(float(cost[c[i], c[j]]) for (i, j), cost in between.items())
-
-
-def _least(own: Scores, between: PairScores) -> Choice:
-    """The choice that no other choice of one member betters, from the members' own best ones."""
-    chosen = {i: int(scores.argmin()) for i, scores in own.items()}
-    while True:
-        now = _total(own, between, chosen)
-        ways = [{**chosen, i: n} for i, scores in own.items() for n in range(len(scores))]
-        best = min(ways, key=lambda way: _total(own, between, way))
-        if _total(own, between, best) >= now - 1e-9:
-            return chosen
-        chosen = best
 
 
 def _landmarks(shapes: Sequence[CoarseShape], hub: int, taken: dict[int, Hypothesis]) -> np.ndarray:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
+from nsm.correspondence.distances import edge_distances
 from nsm.correspondence.finer_maps import Mesh, finer_scores
+from nsm.correspondence.further_ends import further_ends
 from nsm.correspondence.mending import MENDING, mended
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import NOTHING, Candidate, candidates, fixed_pairs
+from nsm.errors import NsmError
 from nsm.stages import at, counted
+from nsm.surfaces import topology
 
 # two maps differ if their images are this far apart in the mean, over √area, or if they take an end
 # of a limb to ends of two limbs
@@ -29,11 +34,13 @@ class Hypothesis:
 
     Attributes:
         vertices: (L, 2) corresponding vertices of source and target: landmarks that were given;
+            of the best map, if it is sure, ends of limbs (:mod:`nsm.correspondence.further_ends`);
             tips that the map brings near to each other; cones of the orbifold that are no tips,
             only where the others are fewer than four.
         score: of the coarse map; lower is better. Of those that hardly differ, the best has the
             best score, and the others are as far behind as finer maps are.
-        whole: whether all tips of one shape go to tips of the other.
+        whole: whether all tips of one shape go to tips of the other; not asked where five landmarks
+            or more were given.
         candidate: the coarse map.
     """
 
@@ -89,28 +96,62 @@ def proposed(
     shapes = [coarse_shape(*mesh, fixed=given[:, k]) for k, mesh in enumerate(meshes)]
     kept = hypotheses(*shapes)
     margin = _margin(kept)
-    if margin <= LEAST_MARGIN and len(given) < COMMON:
+    if len(given) >= COMMON:
+        # these tell where the map goes: limbs that are left say nothing against it
+        kept[0] = replace(kept[0], whole=True)
+    elif margin <= LEAST_MARGIN:
         kept = _told_apart(kept, meshes)
-    return Proposal(kept, min(margin, _margin(kept)), len(given))
+    found = Proposal(kept, min(margin, _margin(kept)), len(given))
+    if found.sure and len(kept[0].vertices) >= COMMON:
+        kept[0] = _completed(kept[0], given, meshes)
+    return found
 
 
 def _margin(kept: list[Hypothesis]) -> float:
     return kept[1].score - kept[0].score if len(kept) > 1 else np.inf
 
 
+def _completed(best: Hypothesis, given: np.ndarray, meshes: tuple[Mesh, Mesh]) -> Hypothesis:
+    """The hypothesis with those ends of limbs that a map through its landmarks meets at little
+    cost; without them where the finer shapes have no layout.
+
+    Given landmarks, if they are five or more, decide alone; tips come after the ends.
+    """
+    at("ends of limbs")
+    known = given if len(given) >= COMMON else best.vertices
+    try:
+        more = further_ends(meshes, known)
+    except NsmError:
+        return best
+    tips = best.vertices[len(known) :]
+    for k, (vertices, faces) in enumerate(meshes):
+        if len(more) and len(tips):
+            apart = edge_distances(vertices, faces, more[:, k])[:, tips[:, k]].min(axis=0)
+            area = topology.face_areas(vertices, faces).sum()
+            tips = tips[apart > _NEAR * np.sqrt(area)]
+    return replace(best, vertices=np.concatenate([known, more, tips]))
+
+
 def _told_apart(kept: list[Hypothesis], meshes: tuple[Mesh, Mesh]) -> list[Hypothesis]:
     """Hypotheses, best first, those that are nearly as good as the first in the order of finer
     maps."""
-    first = kept[0].score
-    near = [h for h in kept if h.score <= first + LEAST_MARGIN]
+    near = [h for h in kept if h.score <= kept[0].score + LEAST_MARGIN]
     at("finer maps")
-    scores = finer_scores(meshes, [h.candidate for h in near], [h.vertices for h in near])
-    if not np.isfinite(scores).all():
-        return kept
-    scores = first + scores - scores.min()
+    scores = told_apart(near, meshes)
     better = [replace(h, score=float(value)) for h, value in zip(near, scores, strict=True)]
     others = [h for h in kept if all(h is not one for one in near)]
     return sorted([*better, *others], key=lambda h: h.score)
+
+
+def told_apart(near: Sequence[Hypothesis], meshes: tuple[Mesh, Mesh]) -> np.ndarray:
+    """The scores (H,) of hypotheses that hardly differ: the best one's, and by how much finer maps
+    of the meshes are behind the best of these.
+
+    They stay as they are where finer maps cannot be compared.
+    """
+    own = np.array([h.score for h in near])
+    scores = finer_scores(meshes, [h.candidate for h in near], [h.vertices for h in near])
+    return own.min() + scores - scores.min() if np.isfinite(scores).all() else own
 
 
 def hypotheses(source: CoarseShape, target: CoarseShape) -> list[Hypothesis]:

@@ -14,6 +14,7 @@ from nsm.domains.orbifold.cones import decimated, extremities
 from nsm.surfaces import topology
 
 _FACES = 3000
+_FINE = 8000  # where small limbs count
 _SOURCES = 96  # of the mean distance
 _LIMB = 0.1  # prominence, over √area
 _SAME, _APART = 0.1, 0.2  # a tip that is nearer to another, over √area
@@ -27,15 +28,33 @@ def tips_of(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
     far = extremities(vertices, faces, count)
     coarse, ids = decimated(vertices, faces, _FACES, far)
     points = vertices[ids]
-    area = topology.face_areas(points, coarse)
-    root = float(np.sqrt(area.sum()))
-    maxima, height = prominences(coarse, mean_distances(points, coarse, area) / root)
-    limbs = maxima[height > _LIMB]
+    root = float(np.sqrt(topology.face_areas(points, coarse).sum()))
+    limbs = _maxima(points, coarse, _LIMB)[0]
     others = np.searchsorted(ids, far)
     apart = edge_distances(points, coarse, others)[:, limbs] / root
     missed = apart.min(axis=0) > _SAME
     near = (apart[:, missed] < _APART).any(axis=1)
     return ids[np.concatenate([others[~near], limbs[missed]])[:count]]
+
+
+def limb_ends(
+    vertices: np.ndarray, faces: np.ndarray, prominence: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of limbs (S,) of a closed mesh (V, 3), (F, 3), and their prominences (S,) over √area.
+
+    They are more prominent than ``prominence``; the most prominent come first.
+    """
+    coarse, ids = decimated(vertices, faces, _FINE)
+    found, height = _maxima(vertices[ids], coarse, prominence)
+    return ids[found], height
+
+
+def _maxima(points: np.ndarray, faces: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Maxima (S,) of the mean distance, and their prominences (S,) over √area, if above ``least``;
+    the most prominent come first."""
+    area = topology.face_areas(points, faces)
+    found, height = prominences(faces, mean_distances(points, faces, area) / np.sqrt(area.sum()))
+    return found[height > least], height[height > least]
 
 
 def mean_distances(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:

@@ -7,7 +7,15 @@ import pytest
 import trimesh
 from limbs import LIMBS, star
 
-from nsm.correspondence import finer_maps, proposal, proposed, proposed_for_all, search
+from nsm.correspondence import (
+    collection_proposal,
+    finer_maps,
+    further_ends,
+    proposal,
+    proposed,
+    proposed_for_all,
+    search,
+)
 from nsm.correspondence.coarse_shape import coarse_shape
 from nsm.correspondence.layouts import affine_maps, layout, quick_scores, table
 from nsm.correspondence.mending import left_apart, mended
@@ -45,16 +53,31 @@ def pair():
     return (vertices, faces), (moved, number[faces]), (tips, number[tips])
 
 
-@pytest.fixture
-def quick(monkeypatch):
+def quicken(monkeypatch):
     """A search of fewer maps, enough for shapes that are equal or nearly so."""
     rounds = (Round(60, 3, 10), Round(10, 6, 30))
     monkeypatch.setattr(search, "_SOURCE_SETS", 1)
     monkeypatch.setattr(search, "_TARGET_SETS", 6)
     monkeypatch.setattr(proposal, "candidates", lambda s, t: search.candidates(s, t, rounds))
     monkeypatch.setattr(proposal, "MENDING", ())
+    monkeypatch.setattr(further_ends, "FACES", 1000)
+    monkeypatch.setattr(further_ends, "ROUND", Round(0, 5, 30))
+    monkeypatch.setattr(further_ends, "DRAWN", Round(0, 6, 30))
     monkeypatch.setattr(finer_maps, "FACES", 1200)
     monkeypatch.setattr(finer_maps, "ROUNDS", (Round(0, 4, 15), Round(0, 6, 15)))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    quicken(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def two_maps(pair):
+    """The right hypothesis, and a wrong one."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        quicken(monkeypatch)
+        return proposed(*pair[:2]).hypotheses[:2]
 
 
 def test_a_turned_and_stretched_shape_is_recognised(pair, quick):
@@ -195,6 +218,9 @@ def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch
     """Three limbs have landmarks; two landmarks lie between limbs; two limbs are left."""
     monkeypatch.setattr(proposal, "MENDING", (Round(4, 8, 30),))
     monkeypatch.setattr(search, "_THROUGH", Round(8, 5, 60))
+    monkeypatch.setattr(further_ends, "FACES", 1000)
+    monkeypatch.setattr(further_ends, "ROUND", Round(0, 5, 40))
+    monkeypatch.setattr(further_ends, "DRAWN", Round(0, 6, 30))
     source, target, tips = pair
     between = np.abs(np.linalg.norm(source[0], axis=1) - 1).argsort()[[0, 40]]
     ours = np.concatenate([tips[0][:3], between])
@@ -210,11 +236,17 @@ def test_limbs_without_a_landmark_complete_five_that_are_given(pair, monkeypatch
         assert limb.argmin() == its.argmin()
         left.add(int(limb.argmin()))
     assert left == {3, 4}
+    # where the map is far from an isometry, no ends are looked for
+    monkeypatch.setattr(proposal, "LARGEST_SCORE", 0.1)
+    monkeypatch.setattr(proposal, "further_ends", None)
+    assert not proposed(source, target, given).sure
 
 
-def test_finer_maps_tell_the_right_one_of_two_that_hardly_differ(pair, quick, monkeypatch):
+def test_finer_maps_tell_the_right_one_of_two_that_hardly_differ(
+    pair, two_maps, quick, monkeypatch
+):
     source, target, _ = pair
-    first, second = proposed(source, target).hypotheses[:2]
+    first, second = two_maps
     candidates = [second.candidate, first.candidate]
     scores = finer_maps.finer_scores(
         (source, target), candidates, [second.vertices, first.vertices]
@@ -255,3 +287,28 @@ def test_a_collection_is_matched_with_one_hub(pair, quick):
     assert np.array_equal(limbs[0], limbs[1]) and np.array_equal(limbs[0], limbs[2])
     for other in found.vertices[1:]:
         assert other[0].tolist() == best[0].tolist()  # the given one in every hypothesis
+
+
+def test_near_ties_of_a_collection_are_decided_by_finer_maps(pair, two_maps, monkeypatch):
+    """The coarse maps of two members are wrong, and hold each other there."""
+    source, target, _ = pair
+    first, second = two_maps
+    tie = [replace(second, score=1.0, whole=True), replace(first, score=1.1, whole=True)]
+    seen = []
+
+    def finer(meshes, found, drawn):
+        seen.append(meshes[1])
+        assert np.array_equal(meshes[0][0], source[0]) and len(found) == len(drawn) == 2
+        return np.array([3.0 if one is second.candidate else 2.0 for one in found])
+
+    monkeypatch.setattr(proposal, "finer_scores", finer)
+    monkeypatch.setattr(collection_proposal, "hub_of", lambda _: 0)
+    monkeypatch.setattr(collection_proposal, "hypotheses", lambda *_: list(tie))
+    found = proposed_for_all([source, target, target])
+    assert len(seen) == 2 and all(mesh is target for mesh in seen)
+    assert set(map(tuple, found.vertices[0][:, :2])) == set(map(tuple, first.vertices))
+    assert np.array_equal(found.vertices[0][:, 1], found.vertices[0][:, 2])
+    assert found.margin == pytest.approx(0.1) and not found.sure  # as the coarse maps have it
+    # no finer maps are made where the first is clearly ahead
+    tie[1] = replace(first, score=1.5)
+    assert proposed_for_all([source, target, target]).sure and len(seen) == 2
