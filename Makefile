@@ -35,6 +35,7 @@ bench-steps: .venv/.nsm-dev
 bench-maps: .venv/.nsm-dev
 	$(BIN)/python benchmarks/maps.py $(if $(MESHES),--meshes $(MESHES))
 	$(BIN)/python benchmarks/closed_maps.py $(if $(MESHES),--meshes $(MESHES))
+	$(BIN)/python benchmarks/newton_steps.py $(if $(MESHES),--meshes $(MESHES))
 
 # Flattening by the isometric and the conformal energy, with a picture: two minutes. MESHES as above.
 bench-flattening: .venv/.nsm-dev

@@ -19,6 +19,7 @@ from nsm.tasks import Overfit
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import candidates  # noqa: E402
+import newton_steps  # noqa: E402
 import steps  # noqa: E402
 from training import train  # noqa: E402
 
@@ -241,3 +242,19 @@ def test_a_candidate_trains(settings, surface, request):
         assert sizes[0] == 64 and sizes[-1] == 256 and sizes == sorted(sizes)
     else:
         assert set(sizes) == {64}
+
+
+def test_slims_proxies_have_the_gradient_of_the_energy():
+    generator = torch.Generator().manual_seed(0)
+    phi, psi, h = torch.randn(3, 30, 2, 2, generator=generator).double()
+    source, target = phi.mT @ phi, psi.mT @ psi
+    hessians = newton_steps.proxies(source, target, h)
+    assert (torch.linalg.eigvalsh(hessians) > 0).all()
+    at = h.clone().requires_grad_()
+    energy = nsm.energies.symmetric_dirichlet(source, at.mT @ target @ at)
+    gradient = torch.autograd.grad(energy.sum(), at)[0].flatten(1)
+    # the proxy's minimum: the singular values of psi h phi^-1 are those of the least energy
+    u, _, v = torch.linalg.svd(psi @ h @ torch.linalg.inv(phi))
+    least = 0.99**0.5 * torch.linalg.inv(psi) @ u @ v @ phi
+    found = (hessians @ (h - least).flatten(1)[..., None])[..., 0]
+    torch.testing.assert_close(found, gradient, rtol=1e-4, atol=1e-5)

@@ -55,6 +55,7 @@ TASKS = {
     ("loss_weights", "collection_newton"): "collection_map",
     ("loss_weights", "pair_newton"): "pair_map",
     ("optimizer", "adam_newton"): "pair_map",
+    ("optimizer", "collection_newton"): "collection_map",
     ("experiment", "adam"): "pair_map",
     ("published", "collection_map"): "collection_map",
     ("data", "collection"): "collection_map",

@@ -172,7 +172,7 @@ def rows(text):
         (
             "optimization",
             "## Error over time",
-            ["overfit.md", "steps.md", "peers.md"],
+            ["overfit.md", "steps.md", "peers.md", "newton_steps.md"],
         ),
         ("activations", "| activation |", ["activation.md"]),
         ("robustness", "<!-- table -->", ["torture.md"]),

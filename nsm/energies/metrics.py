@@ -50,6 +50,12 @@ def first_fundamental_form(jacobian: Tensor) -> Tensor:
     return jacobian.transpose(-1, -2) @ jacobian
 
 
+def determinant(matrix: Tensor) -> Tensor:
+    """det (...) of matrices (..., 2, 2), in a fraction of the time of ``torch.linalg.det``."""
+    a, b, c, d = matrix.flatten(-2).unbind(dim=-1)
+    return a * d - b * c
+
+
 def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
     """Trace and determinant of A⁻¹B.
 
@@ -83,5 +89,5 @@ def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
 
 
 def _entries(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    m = widen(metric)
-    return m[..., 0, 0], (m[..., 0, 1] + m[..., 1, 0]) / 2, m[..., 1, 1]
+    a, b, c, d = widen(metric).flatten(-2).unbind(dim=-1)
+    return a, (b + c) / 2, d

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from nsm.instantiation import target_of
+from nsm.maps.at_points import AtPoints
 from nsm.maps.encodings import _bspline, transformed
 
 _DEGREE = 2
 _TAPS = (_DEGREE + 1) ** 2
-_KEPT = 8  # sets of points whose weights are kept
-_FEW = 4096
-_MOST = 1 << 17  # larger sets are not kept
+_FEW = 4096  # points of a set
+# points whose weights are kept: of small sets, and of large ones, ordered for the gradient
+_KEPT, _KEPT_ORDERED = 1 << 16, 1 << 18
 
 
 class _Weights:
@@ -25,20 +26,47 @@ class _Weights:
     with them, W c, and the gradient is the transposed product, both as sums over short rows.
 
     Args:
-        x: the points (N, 2).
         rows: (N, 9) of the coefficients.
         weights: (P, N, 9), of the value and perhaps the tangents.
         count: of all rows.
     """
 
-    def __init__(self, x: Tensor, rows: Tensor, weights: Tensor, count: int) -> None:
-        self.x, self.planes = x, len(weights)
+    def __init__(self, rows: Tensor, weights: Tensor, count: int) -> None:
         self.rows = rows.repeat(len(weights), 1)
         self.weights = weights.flatten(0, 1)
         place, order = self.rows.flatten().sort(stable=True)
         self.of = order // _TAPS  # the entry of W c that each weight belongs to
         self.turned = self.weights.flatten()[order]
-        self.starts = torch.searchsorted(place, torch.arange(count, device=x.device))
+        self.starts = torch.searchsorted(place, torch.arange(count, device=rows.device))
+
+
+class _ProductOnce(torch.autograd.Function):
+    """W c for few points: their shares of the gradient are added up as they come."""
+
+    @staticmethod
+    def forward(ctx: Any, coefficients: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+        """(count, d), (N, 9), (P, N, 9) to (P · N, d)."""
+        ctx.save_for_backward(rows, weights)
+        ctx.count = len(coefficients)
+        return _sums(coefficients, rows.repeat(len(weights), 1), weights.flatten(0, 1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        rows, weights = ctx.saved_tensors
+        # points innermost: long rows for the processor
+        planes = zip(
+            weights.transpose(1, 2).contiguous(),
+            gradient.view(*weights.shape[:2], gradient.shape[1]).transpose(1, 2).contiguous(),
+            strict=True,
+        )
+        w, g = next(planes)
+        shares = w * g[:, None]
+        for w, g in planes:
+            shares.addcmul_(w, g[:, None])  # (d, 9, N)
+        total = gradient.new_zeros(len(shares), ctx.count)
+        total.scatter_add_(1, rows.t().flatten().expand(len(total), -1), shares.flatten(1))
+        return total.t(), None, None
 
 
 class _Product(torch.autograd.Function):
@@ -66,8 +94,7 @@ def _sums(table: Tensor, rows: Tensor, weights: Tensor, starts: Tensor | None = 
 class SplineField(nn.Module):
     """One uniform quadratic B-spline on [-1, 1]²: linear in its coefficients, zero at the start.
 
-    Weights of large sets of points, as those of a fixed quadrature, which come again, are kept,
-    ordered for the gradient. Small ones are batches of other points each time.
+    What points see of the coefficients is kept, in case they come again.
 
     Args:
         out_dim: of the values.
@@ -95,7 +122,7 @@ class SplineField(nn.Module):
         self.out_dim, self.cells = int(out_dim), int(cells)
         rows = self.side**2 // (2 if odd else 1)
         self.coefficients = nn.Parameter(torch.zeros(rows, out_dim))
-        self._recent: list[_Weights] = []
+        self._few, self._many = AtPoints(_KEPT), AtPoints(_KEPT_ORDERED)
         self._watched: list[tuple[Tensor, Tensor]] | None = None
 
     @property
@@ -113,9 +140,6 @@ class SplineField(nn.Module):
             "periodic": self.periodic,
             "odd": self.odd,
         }
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_recent": []}
 
     def seen(self, x: Tensor, tangents: bool) -> tuple[Tensor, Tensor]:
         """What points (N, 2) see of the coefficients.
@@ -170,23 +194,17 @@ class SplineField(nn.Module):
             rows, weights = self.seen(points, tangents)
             out = (weights[..., None] * self.coefficients[rows]).sum(dim=-2)
         elif len(points) > _FEW and torch.is_grad_enabled() and self.coefficients.requires_grad:
-            out = _Product.apply(self.coefficients, self._weights(points, tangents))
+            count = len(self.coefficients)
+            ordered = self._many.get(
+                points, lambda: _Weights(*self.seen(points, tangents), count), tangents
+            )
+            out = _Product.apply(self.coefficients, ordered)
+        elif len(points) > _FEW:
+            out = _ProductOnce.apply(self.coefficients, *self.seen(points, tangents))
         else:
-            rows, weights = self.seen(points, tangents)
-            out = _sums(self.coefficients, rows.repeat(planes, 1), weights.flatten(0, 1))
+            known = self._few.get(points, lambda: self.seen(points, tangents), tangents)
+            out = _ProductOnce.apply(self.coefficients, *known)
         return out.view(planes, *x.shape[:-1], self.out_dim)
-
-    def _weights(self, x: Tensor, tangents: bool) -> _Weights:
-        """The weights of points (N, 2), kept if they were asked for before."""
-        planes = 3 if tangents else 1
-        for at, known in enumerate(self._recent):
-            if known.planes == planes and known.x.device == x.device and torch.equal(known.x, x):
-                self._recent.append(self._recent.pop(at))
-                return known
-        made = _Weights(x.clone(), *self.seen(x, tangents), len(self.coefficients))
-        if len(x) <= _MOST:
-            self._recent = [*self._recent[1 - _KEPT :], made]
-        return made
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (..., 2) to values (..., out_dim)."""

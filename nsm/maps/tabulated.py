@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from scipy.ndimage import spline_filter1d
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
+from nsm.maps.at_points import AtPoints
 from nsm.maps.composition import PointMap
-from nsm.maps.encodings import SplineGrid
+from nsm.maps.encodings import SplineGrid, transformed
 from nsm.maps.lattice_grid import LatticeSplineGrid
 
 _EXTENT = 1.05  # half the side of the square that a bounded Ω's table covers
 _AT_ONCE = 8192
-_KEPT = 4
+_KEPT = 1 << 18  # points at which Jacobians are remembered
+
+
+class _Read(torch.autograd.Function):
+    """Values of a table, which is not trained, at points; their gradient is by the tangents."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, table: Tabulated) -> Tensor:
+        """(N, 2) to (N, 3)."""
+        value, *tangents = table.stack(x)
+        ctx.save_for_backward(*tangents)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        by = [(gradient * tangent).sum(dim=1) for tangent in ctx.saved_tensors]
+        return torch.stack(by, dim=1), None
 
 
 class Tabulated(nn.Module):
@@ -56,11 +75,18 @@ class Tabulated(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 3)."""
+        if x.requires_grad and not transformed() and not torch.compiler.is_compiling():
+            value: Tensor = _Read.apply(x, self)
+            return value
         return self.grid(x)[..., -self.grid.features :]
+
+    def stack(self, x: Tensor) -> Tensor:
+        """Values and both tangents at (N, 2), stacked: (3, N, 3)."""
+        return self.grid.value_and_jacobian_stack(x)[..., -self.grid.features :]
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, 3) and Jacobians (N, 3, 2)."""
-        stack = self.grid.value_and_jacobian_stack(x)[..., -self.grid.features :]
+        stack = self.stack(x)
         return stack[0], stack[1:].permute(1, 2, 0)
 
 
@@ -74,7 +100,7 @@ class Remembered(nn.Module):
     def __init__(self, surface: nn.Module) -> None:
         super().__init__()
         self.surface = surface
-        self._recent: list[tuple[Tensor, tuple[Tensor, Tensor]]] = []
+        self._known = AtPoints(_KEPT)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 3)."""
@@ -85,12 +111,5 @@ class Remembered(nn.Module):
         """(N, 2) to the values (N, 3) and Jacobians (N, 3, 2)."""
         if torch.is_grad_enabled():
             return cast(PointMap, self.surface).value_and_jacobian(x)
-        for at, result in self._recent:
-            if at.device == x.device and torch.equal(at, x):
-                return result
-        result = cast(PointMap, self.surface).value_and_jacobian(x)
-        self._recent = [*self._recent[1 - _KEPT :], (x.clone(), result)]
-        return result
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_recent": []}
+        surface = cast(PointMap, self.surface)
+        return self._known.get(x, lambda: surface.value_and_jacobian(x))

@@ -44,9 +44,11 @@ class DivergenceGuard(Callback):
         self.rollbacks: list[dict[str, int]] = []
         self.loss: Tensor | None = None
         self.microbatches = 1
+        self.parameters: list[torch.nn.Parameter] = []
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.begun = True
+        self.parameters = list(pl_module.parameters())  # to walk through them takes long
 
     def on_before_backward(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, loss: Tensor
@@ -56,7 +58,7 @@ class DivergenceGuard(Callback):
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer
     ) -> None:
-        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        gradients = [p.grad for p in self.parameters if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients)
         good = bool(torch.isfinite(norm)) and (self.loss is None or bool(torch.isfinite(self.loss)))
         if trainer.strategy.reduce_boolean_decision(good):  # all processes do the same

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import first_fundamental_form
+from nsm.energies.metrics import determinant
 from nsm.tasks.curvature import Curvature, positive_hessians
 from nsm.tasks.fold_barrier import Folds
 from nsm.tasks.mesh_quadrature import MeshQuadrature
@@ -48,9 +49,9 @@ class Caps(nn.Module):
         some = self.quadrature.take()
         image = h(some.uv)
         B = first_fundamental_form(some.sides(psi(image)))
-        determinant = some.relative(some.sides(image))
+        relative = some.relative(some.sides(image))
         values = energy.total(energy.parts(some.metric, B, some.at))
-        folds = self.folds(determinant, step)
+        folds = self.folds(relative, step)
         share = some.share
         return (share * (_WEIGHT * values.clamp(min=0).log1p() + folding * folds)).sum()
 
@@ -67,7 +68,7 @@ class Caps(nn.Module):
         def term(j: Tensor) -> Tensor:
             target = first_fundamental_form(outer @ j)
             values = energy.total(energy.parts(source, target, at))
-            folds = self.folds(torch.linalg.det(j), step)
+            folds = self.folds(determinant(j), step)
             return _WEIGHT * values.clamp(min=0).log1p() + folding * folds
 
         hessians = some.share.double()[:, None, None] * positive_hessians(term, jacobian)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import At, boundary, first_fundamental_form, inside, outside
+from nsm.energies.metrics import determinant
 from nsm.maps import LatticeAligned, Rotated, batched
 from nsm.settings import CollectionConstraints
 from nsm.tasks.collection_quadrature import CollectionQuadrature, Turn
@@ -205,8 +206,8 @@ class CollectionMap(ConstrainedMap):
         """
         starts = torch.stack([h.before(x) for h in self.map])  # type: ignore[operator]
         outer = batched(list(self.phis)).value_and_jacobian(starts)[1]
-        density = torch.linalg.det(first_fundamental_form(outer)).clamp(min=0).sqrt().mean(dim=0)
-        share = torch.linalg.det(forms).clamp(min=0).sqrt() / density.clamp(min=1e-12)
+        density = determinant(first_fundamental_form(outer)).clamp(min=0).sqrt().mean(dim=0)
+        share = determinant(forms).clamp(min=0).sqrt() / density.clamp(min=1e-12)
         if not self.exact:  # samples that a map sends out of Ω do not count
             share = share * inside(self.domain, images).all(dim=0)
         return share
@@ -246,7 +247,7 @@ class CollectionMap(ConstrainedMap):
         def energy(i: int, j: Tensor) -> Tensor:
             """The part of the loss at each sample that the map of surface i has."""
             own = first_fundamental_form(outer[i].double() @ j)
-            total = scale * w.injectivity / len(x) * self.folds_of[i](torch.linalg.det(j), step)
+            total = scale * w.injectivity / len(x) * self.folds_of[i](determinant(j), step)
             for other in (n for n in range(k) if n != i):
                 there, here = At(images[i], positions[i]), At(images[other], positions[other])
                 to = self.energy.total(self.energy.parts(own, forms[other], there))
@@ -267,15 +268,15 @@ class CollectionMap(ConstrainedMap):
         with torch.no_grad():
             image, jacobian = h.value_and_jacobian(x)  # type: ignore[operator]
             outer = phi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
-            determinant = some.relative(some.sides(h(some.uv)))
-            excess = (determinant - torch.linalg.det(jacobian)).double()
+            relative = some.relative(some.sides(h(some.uv)))
+            excess = (relative - determinant(jacobian)).double()
         share = pairs * turn.share.double() / turn.share.sum()
         folding = scale * self.loss_weights.injectivity * some.oriented.double()
 
         def loss(j: Tensor) -> Tensor:
             ends = turn.ends(first_fundamental_form(outer @ j))
             values = share * self.energy.total(self.energy.parts(*ends, turn.at))
-            folds = self.folds_of[i](torch.linalg.det(j) + excess, step, smooth=True)
+            folds = self.folds_of[i](determinant(j) + excess, step, smooth=True)
             return (folding * folds).index_add(0, turn.of, values)
 
         found = [Curvature(h, x, positive_hessians(loss, jacobian))]
@@ -287,7 +288,7 @@ class CollectionMap(ConstrainedMap):
         images, inner = batched(list(self.map)).value_and_jacobian(x.expand(len(self.map), -1, -1))
         positions, outer = batched(list(self.phis)).value_and_jacobian(images)
         metrics = first_fundamental_form(outer @ inner)
-        parts = metrics, torch.linalg.det(inner), images, positions
+        parts = metrics, determinant(inner), images, positions
         return tuple(part.transpose(0, 1) for part in parts)  # type: ignore[return-value]
 
     def _boundary_term(self, images: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -111,8 +112,11 @@ class CollectionQuadrature(nn.Module):
         some = triangles(torch.cat(corners), faces, torch.cat([part.points for part in parts]))
         share = torch.cat([part.share for part in parts]) / len(parts)
         known = some.uv.isfinite().all(dim=1)[faces].all(dim=1)
-        some = some._replace(
-            uv=some.uv.nan_to_num(), share=share * known, oriented=share * (some.oriented > 0)
+        some = replace(
+            some,
+            uv=some.uv.nan_to_num(),
+            share=share * known,
+            oriented=share * (some.oriented > 0),
         )
         owner = torch.cat(
             [torch.full_like(p.share, j, dtype=torch.long) for j, p in enumerate(parts)]
@@ -124,7 +128,7 @@ class CollectionQuadrature(nn.Module):
         of = torch.cat([inward, *[outward] * len(others)])
         held = [some.metric[inward], *(first_fundamental_form(sides) for sides in images)]
         centres = torch.cat([part.centres for part in parts])
-        on_surfaces = torch.cat([part.centres_on(part.points) for part in parts])
+        on_surfaces = torch.cat([part.positions for part in parts])
         at = At(centres[of], on_surfaces[of])
         return Turn(number, some, of, owner[of] == number, torch.cat(held), at)
 

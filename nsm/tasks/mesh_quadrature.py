@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from nsm.energies import At, first_fundamental_form
+from nsm.energies.metrics import determinant
 
 _AT_ONCE = 8192
 MOST = 65_536  # triangles of a mesh that are all taken
 _THIN = 1e-4  # height of a triangle in Ω
 
 
-class Triangles(NamedTuple):
-    """Some of a mesh's triangles.
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Some of a mesh's triangles. What does not depend on a map is computed once.
 
     Attributes:
         uv: (V, 2) their corners in Ω.
@@ -36,31 +40,53 @@ class Triangles(NamedTuple):
     determinant: Tensor
     oriented: Tensor
 
+    @cached_property
+    def _corners(self) -> Tensor:
+        """(3F,) in ``uv``: all first corners, all second, all third."""
+        return self.faces.t().flatten()
+
+    @cached_property
+    def _own(self) -> tuple[Tensor, Tensor]:
+        """(F,) whether single precision tells an orientation; the determinants where it does."""
+        told = self.oriented > 0
+        return told, torch.where(told, self.determinant, 1.0)
+
+    def corners_on(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The three corners, (F, n) each, of the triangles with images (V, n) of the corners."""
+        # not by image[faces], whose backward pass sorts
+        a, b, c = image.index_select(0, self._corners).view(3, -1, image.shape[1]).unbind()
+        return a, b, c
+
     def sides(self, image: Tensor) -> Tensor:
         """The first two sides (F, n, 2) of the triangles with images (V, n) of the corners."""
-        a, b, c = image[self.faces].unbind(dim=1)
+        a, b, c = self.corners_on(image)
         return torch.stack([b - a, c - a], dim=-1)
 
     def relative(self, sides: Tensor) -> Tensor:
         """Determinants (F,) of sides (F, 2, 2) that a planar map makes of the triangles' own, in
         units of these; 1 where single precision does not tell."""
-        told = self.oriented > 0
-        own = torch.where(told, self.determinant, 1.0)
-        return torch.where(told, sides.det() / own, 1.0)
+        told, own = self._own
+        return torch.where(told, determinant(sides) / own, 1.0)
 
     def centres_on(self, image: Tensor) -> Tensor:
         """The centres (F, n) of the triangles with images (V, n) of the corners."""
-        return image[self.faces].mean(dim=1)
+        a, b, c = self.corners_on(image)
+        return (a + b + c) / 3
 
-    @property
+    @cached_property
     def centres(self) -> Tensor:
         """(F, 2) in Ω."""
         return self.centres_on(self.uv)
 
+    @cached_property
+    def positions(self) -> Tensor:
+        """(F, 3): the centres on the surface."""
+        return self.centres_on(self.points)
+
     @property
     def at(self) -> At:
         """The centres in Ω and on the surface."""
-        return At(self.centres, self.centres_on(self.points))
+        return At(self.centres, self.positions)
 
 
 class MeshQuadrature(nn.Module):
@@ -109,7 +135,8 @@ class MeshQuadrature(nn.Module):
             rows, faces = self.faces[found].unique(return_inverse=True)
             part = triangles(self.uv[rows], faces, points[rows])
             share = times.to(part.share) / count
-            whole = part._replace(share=share, oriented=share * (part.oriented > 0))
+            oriented = share * (part.oriented > 0)
+            whole = replace(part, share=share, oriented=oriented)
         self._taken = (count, most), whole
         return whole
 
@@ -118,10 +145,10 @@ def triangles(uv: Tensor, faces: Tensor, points: Tensor) -> Triangles:
     """Those with corners uv (V, 2) in Ω and points (V, 3) of the surface, faces (F, 3)."""
     some = Triangles(uv, faces, points, uv, uv, uv, uv)
     metric = first_fundamental_form(some.sides(points))
-    area = torch.linalg.det(metric.double()).clamp(min=0).sqrt()
+    area = determinant(metric.double()).clamp(min=0).sqrt()
     share = (area / area.sum()).to(metric.dtype)
     sides = some.sides(uv)
-    determinant = torch.linalg.det(sides)
+    signed = determinant(sides)
     longest = torch.cat([sides, sides[..., :1] - sides[..., 1:]], dim=-1).norm(dim=1).amax(dim=1)
-    oriented = torch.where(determinant > _THIN * longest, share, 0.0)
-    return some._replace(metric=metric, share=share, determinant=determinant, oriented=oriented)
+    oriented = torch.where(signed > _THIN * longest, share, 0.0)
+    return replace(some, metric=metric, share=share, determinant=signed, oriented=oriented)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import MutableMapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from nsm.maps import SplineField
-from nsm.tasks.spline_level import Level
 
 _LEAST = 4  # cells
+_NEAR, _FAR = 0.75, 0.25  # of quadratic B-splines, as in nsm.tasks.multigrid
 # A coefficient is its coordinate times this over √cells: a step of a fine level then does not
 # change slopes much more than that of a coarse one.
 _SCALE = 0.5
@@ -40,11 +39,7 @@ class MultilevelAdam:
         while cells[0] % 2 == 0 and cells[0] // 2 >= _LEAST and not (field.odd and cells[0] % 4):
             cells.insert(0, cells[0] // 2)
         self.scales = [_SCALE / n**0.5 for n in cells]
-        self.refinements = [
-            _on(Level(SplineField(1, 2 * n, field.periodic, field.odd), n).up, field.coefficients)
-            for n in cells[:-1]
-        ]
-        self.turned = [up.t().coalesce() for up in self.refinements]
+        self.two_scale = TwoScale(field)
 
     def change(
         self, gradient: Tensor, state: MutableMapping[str, Any], step: int, lr: float
@@ -53,13 +48,13 @@ class MultilevelAdam:
 
         Args:
             gradient: (rows, d) by the coefficients.
-            state: of the optimizer; the moments of each level are ``moments_NUMBER`` (2, rows, d).
+            state: of the optimizer; the moments of each level are ``moments_NUMBER`` (2, d, n, m).
             step: from 0.
             lr: the rate.
         """
-        of_levels = [gradient]
-        for down in reversed(self.turned):
-            of_levels.insert(0, down @ of_levels[0])
+        of_levels = [self.two_scale.table(gradient)]
+        while len(of_levels) < len(self.scales):
+            of_levels.insert(0, self.two_scale.transposed(of_levels[0]))
         of_levels = [scale * g for scale, g in zip(self.scales, of_levels, strict=True)]
         # one bad sample would be remembered in the moments for long
         norm = torch.stack([g.norm() for g in of_levels]).norm()
@@ -72,25 +67,71 @@ class MultilevelAdam:
             unbiased = [1 - beta ** (step + 1) for beta in self.betas]
             root = (second / unbiased[1]).sqrt_().add_(self.eps)
             own = first / root * (-lr * scale / unbiased[0])
-            total = own if total is None else self.refinements[number - 1] @ total + own
+            total = own if total is None else self.two_scale.refined(total) + own
         assert total is not None
-        return total
+        return self.two_scale.rows(total)
 
     def _moments(self, state: MutableMapping[str, Any], number: int, g: Tensor) -> Tensor:
         key = f"moments_{number}"
         if key not in state:
             state[key] = torch.zeros(2, *g.shape, dtype=g.dtype, device=g.device)
+        elif state[key].dim() == 3:  # (2, rows, d) of an earlier version's checkpoint
+            state[key] = state[key].mT.reshape(2, *g.shape)
         moments: Tensor = state[key]
         return moments
 
 
-def _on(matrix: Any, like: Tensor) -> Tensor:
-    """A sparse matrix of the type and on the device of a tensor."""
-    m = matrix.tocoo()
-    places = torch.from_numpy(np.stack([m.row, m.col]).astype(np.int64))
-    values = torch.from_numpy(m.data.astype(np.float64)).to(like.dtype)
-    return (
-        torch.sparse_coo_tensor(places, values, m.shape, check_invariants=False)
-        .coalesce()
-        .to(like.device)
-    )
+class TwoScale:
+    """The two-scale relation of a spline's tables, and its transpose.
+
+    A table is (d, n, m): n rows and m columns of coefficients for each of d components. An odd
+    spline's has half of the rows; those beyond are the same ones, turned and negative.
+
+    Args:
+        field: a spline of the same kind, of whatever size.
+    """
+
+    def __init__(self, field: SplineField) -> None:
+        self.periodic, self.odd, self.side = field.periodic, field.odd, field.side
+
+    def table(self, rows: Tensor) -> Tensor:
+        """Coefficients of the spline (rows, d) as its table."""
+        return rows.t().reshape(rows.shape[1], -1, self.side)
+
+    def rows(self, table: Tensor) -> Tensor:
+        """The inverse of :meth:`table`, of a level (d, n, m): (n · m, d)."""
+        return table.flatten(1).t()
+
+    def refined(self, table: Tensor) -> Tensor:
+        """The table of the same spline on a grid of twice as many cells a side."""
+        for axis in (1, 2):
+            wide = self._widened(table, axis) if self.periodic else table
+            count = wide.shape[axis] - 1
+            a, b = wide.narrow(axis, 0, count), wide.narrow(axis, 1, count)
+            fine = torch.stack([_NEAR * a + _FAR * b, _FAR * a + _NEAR * b], dim=axis + 1)
+            table = fine.flatten(axis, axis + 1)
+            if self.periodic:  # without those beside the rows and columns from beyond
+                table = table.narrow(axis, 1, table.shape[axis] - 2)
+        return table
+
+    def transposed(self, table: Tensor) -> Tensor:
+        """The transpose of :meth:`refined`: from a gradient by the finer table to that by the
+        coarser."""
+        for axis in (1, 2):
+            if self.periodic:
+                wide = self._widened(table, axis)
+            else:
+                none = torch.zeros_like(table.narrow(axis, 0, 2))
+                wide = torch.cat([none, table, none], dim=axis)
+            a, b = wide.unflatten(axis, (-1, 2)).unbind(dim=axis + 1)
+            count = a.shape[axis] - 1
+            before = _FAR * a.narrow(axis, 0, count) + _NEAR * b.narrow(axis, 0, count)
+            table = before + _NEAR * a.narrow(axis, 1, count) + _FAR * b.narrow(axis, 1, count)
+        return table
+
+    def _widened(self, table: Tensor, axis: int) -> Tensor:
+        """A periodic table with the rows (axis 1) or columns next beyond its first and last."""
+        first, last = table.narrow(axis, 0, 1), table.narrow(axis, table.shape[axis] - 1, 1)
+        if self.odd and axis == 1:
+            return torch.cat([-first.flip(2), table, -last.flip(2)], dim=1)
+        return torch.cat([last, table, first], dim=axis)

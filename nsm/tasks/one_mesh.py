@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nsm.data import Samples
 from nsm.energies import At
+from nsm.energies.metrics import determinant
 from nsm.tasks.at_triangles import AtTriangles
 from nsm.tasks.curvature import positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier, Folds
@@ -55,9 +56,9 @@ class OneMeshMap(AtTriangles):
             one = batch.uv.new_ones(len(batch.uv))
             return Places(batch.uv, At(batch.uv, batch.points), one / len(one), one, None)
         with torch.no_grad():
-            determinant = some.relative(some.sides(self.map(some.uv)))
+            relative = some.relative(some.sides(self.map(some.uv)))
         told = some.oriented / some.share.clamp(min=1e-30)
-        return Places(some.centres, some.at, some.share, told, determinant)
+        return Places(some.centres, some.at, some.share, told, relative)
 
     def _hessians(
         self,
@@ -78,11 +79,11 @@ class OneMeshMap(AtTriangles):
         """
         excess: Tensor | float = 0.0  # of a triangle's determinant, where it is not that of J_h
         if places.determinant is not None:
-            excess = places.determinant - torch.linalg.det(jacobian)
+            excess = places.determinant - determinant(jacobian)
 
         def loss(j: Tensor) -> Tensor:
             values = self.energy.total(self.energy.parts(source, metric(j), places.at))
-            det = torch.linalg.det(j) + excess
+            det = determinant(j) + excess
             return values + folding * places.told * self.folds(det, self.global_step, smooth=True)
 
         return places.share.double()[:, None, None] * positive_hessians(loss, jacobian)
@@ -98,11 +99,16 @@ class OneMeshMap(AtTriangles):
             sides: (F, 2, 2) of the triangles that h makes of them.
             image_metric: B (F, 2, 2), in the frames of their first two sides.
         """
-        centre = some.centres_on(some.points)
         parts = self.energy.parts(some.metric, image_metric, some.at)
         det = some.relative(sides)
         evaluation = Evaluation(
-            some.centres, centre, some.centres_on(h), some.metric, image_metric, det, some.oriented
+            some.centres,
+            some.positions,
+            some.centres_on(h),
+            some.metric,
+            image_metric,
+            det,
+            some.oriented,
         )
         return Distortion(self.energy, parts, some.share), evaluation
 

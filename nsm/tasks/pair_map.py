@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from nsm.data import Samples
 from nsm.energies import At, boundary, first_fundamental_form, inside, outside
+from nsm.energies.metrics import determinant
 from nsm.maps import Composition, LatticeAligned, Rotated
 from nsm.tasks.caps import Caps
 from nsm.tasks.constrained import ConstrainedMap
@@ -138,7 +139,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         if not self.exact:  # samples that h maps out of Ω do not count
             kept = inside(self.domain, h)
             parts = {name: part[kept] for name, part in parts.items()}
-        det = torch.linalg.det(jacobian)
+        det = determinant(jacobian)
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

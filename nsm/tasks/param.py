@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from nsm.data import Samples
 from nsm.energies import At, first_fundamental_form
+from nsm.energies.metrics import determinant
 from nsm.settings import ParamConstraints, ParamWeights
 from nsm.tasks.boundary_barrier import BoundaryBarrier
 from nsm.tasks.curvature import Curvature
@@ -115,7 +116,7 @@ class Param(OneMeshMap):
         A, jacobian, h = self.pointwise(self._at, batch.uv)
         B = first_fundamental_form(jacobian)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
-        det = torch.linalg.det(jacobian)
+        det = determinant(jacobian)
         return Distortion(self.energy, parts), Evaluation(batch.uv, batch.points, h, A, B, det)
 
     def _at(self, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:

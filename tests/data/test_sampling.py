@@ -150,6 +150,22 @@ def test_pool_holds_every_vertex(uneven):
     assert float(nearest(batch.points, pool.points).max()) < 1e-6
 
 
+def test_batches_come_again(uneven):
+    data = SurfaceData(
+        uneven, Sampler(batches=3, stratified=True), batch_size=50, steps_per_epoch=10
+    )
+    data.setup()
+    drawn = [data.batch(step) for step in range(40)]
+    distinct = {tuple(batch.uv[0].tolist()): batch for batch in drawn}
+    assert len(distinct) == 3
+    again = SurfaceData(
+        uneven, Sampler(batches=3, stratified=True), batch_size=50, steps_per_epoch=10
+    )
+    again.setup()
+    # a training that goes on from step 30 meets what the whole one met there
+    assert all(torch.equal(again.batch(step).points, drawn[step].points) for step in range(30, 40))
+
+
 def test_every_batch_can_have_all_vertices(uneven):
     data = SurfaceData(uneven, Sampler(pool=1000, every_vertex=True), batch_size=64)
     data.setup()
@@ -216,7 +232,9 @@ def test_a_users_own_sampler_needs_one_method():
     assert torch.equal(shared.batch(0), data.points.uv[:3].repeat(3, 1))
 
 
-@pytest.mark.parametrize("settings", [{"vertex_share": 1.5}, {"pool": 0}, {"domain_share": -1}])
+@pytest.mark.parametrize(
+    "settings", [{"vertex_share": 1.5}, {"pool": 0}, {"domain_share": -1}, {"batches": 0}]
+)
 def test_a_sampler_refuses_shares_that_are_none(settings):
     with pytest.raises(ValueError):
         Sampler(**settings)

@@ -58,9 +58,41 @@ def test_weights_follow_the_coefficients_and_the_points():
     with torch.no_grad():
         expected = f(y)
     torch.testing.assert_close(f(y), expected)  # points that changed in place are others
-    for _ in range(2 * _KEPT):
-        f(points())
-    assert len(f._recent) <= _KEPT
+    for _ in range(2 * _KEPT // 4000):
+        f(points(4000))
+    assert 1 <= len(f._few) <= _KEPT // 4000
+
+
+def test_the_gradient_of_few_points_and_of_many():
+    f, x = field(True), points(5000)
+    given = torch.randn(5000, 3, 3, dtype=torch.float64)
+    value, jacobian = f.value_and_jacobian(x)
+    whole = torch.autograd.grad((given * jacobian[..., :1]).sum() + value.sum(), f.coefficients)[0]
+    parts = torch.zeros_like(whole)
+    for some, g in zip(x.split(1000), given.split(1000), strict=True):
+        value, jacobian = f.value_and_jacobian(some)
+        loss = (g * jacobian[..., :1]).sum() + value.sum()
+        parts += torch.autograd.grad(loss, f.coefficients)[0]
+    torch.testing.assert_close(parts, whole)
+
+
+def test_what_a_validation_has_seen_serves_the_training():
+    f, x = field(False), points()
+    phi = Remembered(build_analytic({"name": "saddle"}))
+    with torch.inference_mode():
+        f(x)
+        slopes = phi.value_and_jacobian(x.float())[1]
+    loss = (f(x) ** 2).sum() + (f(x).float() * slopes[..., 0]).sum()
+    assert torch.autograd.grad(loss, f.coefficients)[0].isfinite().all()
+
+
+def test_a_tables_gradient_is_by_its_slopes():
+    table, x = Tabulated(build_analytic({"name": "saddle"}), 32), 0.9 * points().float()
+    jacobian = table.value_and_jacobian(x)[1]
+    at = x.clone().requires_grad_()
+    weights = torch.randn(len(x), 3)
+    found = torch.autograd.grad((weights * table(at)).sum(), at)[0]
+    torch.testing.assert_close(found, (weights[:, None] @ jacobian)[:, 0])
 
 
 def test_periodic_and_clamped():

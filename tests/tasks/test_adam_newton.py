@@ -105,3 +105,15 @@ def test_the_smooth_term_holds_what_a_step_begins_with():
     assert (folds(first / 5, step=0)[:3] > 0).all()
     assert folds(first / 5, step=1)[:3].eq(0).all()  # the next step begins there
     assert Folds("exponential")(first, step=0).gt(0).tolist() == [False, False, False, True]
+
+
+def test_moments_of_an_earlier_version_go_on():
+    field = SplineField(2, 16, True, True).double()
+    generator = torch.Generator().manual_seed(3)
+    gradients = torch.randn(2, *field.coefficients.shape, generator=generator).double()
+    adam = MultilevelAdam(field, (0.9, 0.99), 1e-12, largest=1.0)
+    state = {}
+    adam.change(gradients[0], state, 0, 0.02)
+    earlier = {key: moments.flatten(2).mT.clone() for key, moments in state.items()}  # (2, rows, d)
+    wanted = adam.change(gradients[1], state, 1, 0.02)
+    torch.testing.assert_close(adam.change(gradients[1], earlier, 1, 0.02), wanted)

@@ -1,0 +1,57 @@
+"""What is computed at points, kept for when they come again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+
+class AtPoints:
+    """Results at the sets of points that were asked for last.
+
+    Args:
+        most: points of all sets together; the sets that were not asked for longest are dropped.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most, self.count = most, 0
+        self._known: dict[Hashable, tuple[Tensor, Any]] = {}
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def get(self, x: Tensor, compute: Callable[[], T], kind: Hashable = None) -> T:
+        """What is known at points (N, 2), or else ``compute()``, which is kept.
+
+        Args:
+            x: the points.
+            compute: of them, without a gradient.
+            kind: of the result.
+        """
+        if x.is_meta:  # a sketch without values
+            return compute()
+        key = (kind, x.device, x.dtype, len(x), *x[:1].flatten().tolist())
+        known = self._drop(key)
+        if known is None or not torch.equal(known[0], x):
+            # what a validation computes must serve the training too
+            with torch.inference_mode(False), torch.no_grad():
+                known = x.clone(), compute()
+        self._known[key] = known
+        self.count += len(x)
+        while self.count > self.most:
+            self._drop(next(iter(self._known)))
+        result: T = known[1]
+        return result
+
+    def _drop(self, key: Hashable) -> tuple[Tensor, Any] | None:
+        known = self._known.pop(key, None)
+        self.count -= 0 if known is None else len(known[0])
+        return known
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"most": self.most, "count": 0, "_known": {}}
