@@ -31,6 +31,7 @@ from maps import ANIMALS, table, timed
 import nsm
 
 RESULTS = Path(__file__).parent / "results" / "closed_maps"
+FOUR = tuple(name[-3:] for name in ANIMALS)
 FURTHER = (("385", "391"), ("392", "383"), ("395", "397"), ("398", "400"))
 KEPT = (
     "symmetric_dirichlet_median",
@@ -156,10 +157,9 @@ def cases(meshes: Path, scratch: Path) -> dict[str, Case]:
     def add(name: str, files: Sequence[str], landmarks: Any, domain: str = "orbifold") -> None:
         result[name] = (domain, lambda on, ways: pair(*files, landmarks, on, ways))
 
-    four = [str(meshes / f"{name}.off") for name in ANIMALS]
-    points = [str(marks / f"{name}.vts") for name in ANIMALS]
-    for i, j in itertools.permutations(range(len(ANIMALS)), 2):
-        name = f"{ANIMALS[i][-3:]}-{ANIMALS[j][-3:]}"
+    four, points = shapes(meshes, FOUR, "vts")
+    for i, j in itertools.permutations(range(len(FOUR)), 2):
+        name = f"{FOUR[i]}-{FOUR[j]}"
         result[name] = (  # type: ignore[assignment]
             "orbifold",
             lambda on, ways, i=i, j=j: of_collection(four, points, i, j, on, ways),
@@ -167,17 +167,18 @@ def cases(meshes: Path, scratch: Path) -> dict[str, Case]:
     both = [str(meshes / f"cat_horse-{k}.obj") for k in (0, 1)]
     texts = [str(marks / f"cat_horse-{k}.txt") for k in (0, 1)]
     add("cat-horse", both, texts)
-    add("busts 302-314", *_shapes(meshes, ("302", "314"), "vts"))
-    add("plane-bird 61-248", *_shapes(meshes, ("61", "248"), "pinned"))
+    add("busts 302-314", *shapes(meshes, ("302", "314"), "vts"))
+    add("plane-bird 61-248", *shapes(meshes, ("61", "248"), "pinned"))
     add("genus 1", *rings(scratch), "torus")
     add("horse-cat", both[::-1], texts[::-1])
     for ends in FURTHER:
-        add("-".join(ends), *_shapes(meshes, ends, "vts"))
+        add("-".join(ends), *shapes(meshes, ends, "vts"))
     result["collection"] = ("orbifold", lambda on, ways: collection(four, points, on, ways))
     return result
 
 
-def _shapes(meshes: Path, numbers: Sequence[str], ending: str) -> tuple[list[str], list[str]]:
+def shapes(meshes: Path, numbers: Sequence[str], ending: str) -> tuple[list[str], list[str]]:
+    """The files of shapes by their numbers, and of their landmarks."""
     files = [str(meshes / f"shrec07-{n}.off") for n in numbers]
     return files, [str(meshes / "landmarks" / f"shrec07-{n}.{ending}") for n in numbers]
 

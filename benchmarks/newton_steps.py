@@ -19,15 +19,14 @@ from unittest.mock import patch
 
 import pytorch_lightning as pl
 import torch
-from closed_maps import START, prepared
-from maps import ANIMALS, table
+from closed_maps import FOUR, START, prepared, shapes
+from maps import table
 from pytorch_lightning.callbacks import Callback
 from torch import Tensor
 
 import nsm
 from nsm.energies import first_fundamental_form
 from nsm.energies.distortion import EPSILON
-from nsm.energies.metrics import determinant
 from nsm.pipeline import training
 from nsm.pipeline.pair_map import PairMapTask
 from nsm.tasks import PairMap
@@ -65,14 +64,7 @@ class Proxies(PairMap):
     ) -> Tensor:
         eye = torch.eye(2, dtype=torch.float64).expand(len(jacobian), 2, 2)
         hessians = proxies(source.double(), metric(eye), jacobian.double())
-        excess: Tensor | float = 0.0
-        if places.determinant is not None:
-            excess = places.determinant - determinant(jacobian)
-
-        def folds(j: Tensor) -> Tensor:
-            values = self.folds(determinant(j) + excess, self.global_step, smooth=True)
-            return folding * places.told * values
-
+        folds = self._folds_near(places, jacobian, folding)
         hessians = hessians + positive_hessians(folds, jacobian)
         return places.share.double()[:, None, None] * hessians
 
@@ -113,7 +105,6 @@ BEFORE = [  # the default's steps before these trials
     "optimizer.iterations=15",
     "optimizer.memory=12",
     "scheduler.warmup=100",
-    "sampler=stratified",
 ]
 WAYS: dict[str, tuple[type[PairMap], list[str]]] = {
     "default": (PairMap, []),
@@ -176,17 +167,14 @@ def run(source: Any, target: Any, landmarks: Any, way: str) -> dict[str, Any]:
 
 def ready(meshes: Path, case: str) -> tuple[Any, Any, Any]:
     """The surfaces of a case, as ``closed_maps.py`` prepares them, and their landmarks."""
-    first, second = CASES[case]
-    names = [f"shrec07-{first}", f"shrec07-{second}"]
-    if set(names) <= set(ANIMALS):
-        files = tuple(str(meshes / f"{name}.off") for name in ANIMALS)
-        marks = tuple(str(meshes / "landmarks" / f"{name}.vts") for name in ANIMALS)
-        surfaces, points = prepared(files, marks, "orbifold")
-        i, j = (ANIMALS.index(name) for name in names)
+    numbers = CASES[case]
+    if set(numbers) <= set(FOUR):
+        files, marks = shapes(meshes, FOUR, "vts")
+        surfaces, points = prepared(tuple(files), tuple(marks), "orbifold")
+        i, j = (FOUR.index(number) for number in numbers)
         return surfaces[i], surfaces[j], points[:, [i, j]].tolist()
-    files = tuple(str(meshes / f"{name}.off") for name in names)
-    marks = tuple(str(meshes / "landmarks" / f"{name}.vts") for name in names)
-    start = nsm.map_pair(*files, list(marks), overrides=START, progress=False)
+    files, marks = shapes(meshes, numbers, "vts")
+    start = nsm.map_pair(*files, marks, overrides=START, progress=False)
     return start.source, start.target, start.landmarks.tolist()
 
 

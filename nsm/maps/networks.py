@@ -200,11 +200,8 @@ class NeuralMap(nn.Module):
         """(N, 2) to the values (N, out_dim) and Jacobians (N, out_dim, 2), in forward mode."""
         s = features = value_and_jacobian_stack(self.encoding, x)
         if self._linear:
-            skip = cast(nn.Linear, self.linear_skip)
-            s = s @ skip.weight.T
-            s = torch.cat([s[:1] + skip.bias, s[1:]])
-            return s[0], s[1:].permute(1, 2, 0)
-        if self.fused and not transformed():
+            s = features.new_zeros(3, 1, 1)
+        elif self.fused and not transformed():
             s = MLPWithTangents.apply(
                 s,
                 self.activation,

@@ -77,16 +77,27 @@ class OneMeshMap(AtTriangles):
             metric: from J_h to B, each (N, 2, 2).
             folding: λ_inv.
         """
+        folds = self._folds_near(places, jacobian, folding)
+
+        def loss(j: Tensor) -> Tensor:
+            values = self.energy.total(self.energy.parts(source, metric(j), places.at))
+            return values + folds(j)
+
+        return places.share.double()[:, None, None] * positive_hessians(loss, jacobian)
+
+    def _folds_near(
+        self, places: Places, jacobian: Tensor, folding: float
+    ) -> Callable[[Tensor], Tensor]:
+        """The fold term (N,) at places, as a function of J_h (N, 2, 2); arguments as above."""
         excess: Tensor | float = 0.0  # of a triangle's determinant, where it is not that of J_h
         if places.determinant is not None:
             excess = places.determinant - determinant(jacobian)
 
-        def loss(j: Tensor) -> Tensor:
-            values = self.energy.total(self.energy.parts(source, metric(j), places.at))
+        def folds(j: Tensor) -> Tensor:
             det = determinant(j) + excess
-            return values + folding * places.told * self.folds(det, self.global_step, smooth=True)
+            return folding * places.told * self.folds(det, self.global_step, smooth=True)
 
-        return places.share.double()[:, None, None] * positive_hessians(loss, jacobian)
+        return folds
 
     def _on_triangles(
         self, some: Triangles, h: Tensor, sides: Tensor, image_metric: Tensor
