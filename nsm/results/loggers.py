@@ -7,6 +7,7 @@ import importlib.util
 import json
 import math
 import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ class TensorBoard(TensorBoardLogger):
     """
 
     def __init__(self, folder: str | Path, first_step: int = 0) -> None:
+        _wait_for_a_later_name(Path(folder) / "tensorboard")
         super().__init__(
             folder,
             name="",
@@ -50,6 +52,17 @@ class TensorBoard(TensorBoardLogger):
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         super().log_metrics({k: v for k, v in metrics.items() if k != "epoch"}, step)
+
+
+def _wait_for_a_later_name(folder: Path) -> None:
+    """Wait until a new event file comes last among those of a folder.
+
+    TensorBoard reads them in the order of their names, which begin with the second of their
+    creation; a file that is read out of turn drops what another has logged.
+    """
+    started = [int(file.name.split(".")[3]) for file in folder.glob("events.out.tfevents.*")]
+    while started and time.time() < max(started) + 1:
+        time.sleep(0.05)
 
 
 class CSV(CSVLogger):

@@ -18,6 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import (
     TENSORS,
     EventAccumulator,
 )
+from tensorboard.summary.writer import event_file_writer
 from tensorboard.util import tensor_util
 
 import nsm
@@ -176,7 +177,11 @@ def test_histograms_count_every_weight(runs):
         assert [one.step for one in gradients] == [1, 20]  # none before the first step
 
 
-def test_a_resumed_run_goes_on_in_the_same_logs(tmp_path):
+@pytest.mark.parametrize("number", [0, 9])
+def test_a_resumed_run_goes_on_in_the_same_logs(number, tmp_path, monkeypatch):
+    # TensorBoard numbers its files; read by name, the tenth comes before the ninth of one second
+    counter = event_file_writer.AtomicCounter(number)
+    monkeypatch.setattr(event_file_writer, "_global_uid", counter)
     config = compose_config(["task=overfit", *TINY, "logger=both", "artefacts=false"])
     surface = nsm.Surface.load("plane", cache=False)
     for resuming, steps in ((False, 20), (True, 30)):
