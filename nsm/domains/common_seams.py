@@ -110,6 +110,40 @@ class Tracer:
         self.spokes[j][path[-2]] = 2 * branch + 1
 
 
+def with_nodes_between(tracers: Sequence[Tracer], pieces: int) -> list[Tracer]:
+    """The same branches with further nodes on them, at the same shares of their lengths.
+
+    Args:
+        tracers: of each mesh, with branches; they stay as they are.
+        pieces: how many parts each branch is to have; one stays whole that has too few edges on one
+            of the meshes.
+    """
+    parts = []  # of each branch, and on each mesh, places in its path
+    for paths in zip(*(t.laid for t in tracers), strict=True):
+        places = [_shares(t, path, pieces) for t, path in zip(tracers, paths, strict=True)]
+        whole = any(len(set(at)) <= pieces for at in places)
+        parts.append([[0, len(p) - 1] if whole else at for p, at in zip(paths, places, strict=True)])
+    result = []
+    for m, old in enumerate(tracers):
+        ways = [(path, at[m]) for path, at in zip(old.laid, parts, strict=True)]
+        nodes = [*old.landmarks.tolist(), *(path[k] for path, at in ways for k in at[1:-1])]
+        new = Tracer(old.vertices, old.faces, np.array(nodes, dtype=np.int64), old.cost)
+        new.taken |= old.taken
+        number = {v: k for k, v in enumerate(nodes)}
+        for path, at in ways:
+            for begin, end in itertools.pairwise(at):
+                new.add(number[path[begin]], number[path[end]], path[begin : end + 1])
+        result.append(new)
+    return result
+
+
+def _shares(tracer: Tracer, path: list[int], pieces: int) -> list[int]:
+    """Places in a path that part its length as evenly as its vertices allow, with both ends."""
+    steps = np.linalg.norm(np.diff(tracer.vertices[path], axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
+    return [int(np.abs(along - k / pieces).argmin()) for k in range(pieces + 1)]
+
+
 def _ring(faces: np.ndarray, vertex: int) -> list[int]:
     """The neighbours of an inner vertex, counter-clockwise."""
     following: dict[int, int] = {}

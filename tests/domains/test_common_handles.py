@@ -48,6 +48,20 @@ def pair():
     return meshes, [ids, place[ids]], place
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_few_landmarks_open_handles_from_between_them(pair, count):
+    """At two landmarks fewer edges meet than the branches of two handles need."""
+    meshes, ids, _ = pair
+    surfaces = prepare_jointly(meshes, [one[:count] for one in ids], cache=False)
+    for surface, own in zip(surfaces, ids, strict=True):
+        assert surface.quality["flipped_triangles"] == 0 and topology.is_disc(surface.faces)
+        assert np.isin(own[:count], surface.source_vertex).all()
+    matched = matched_landmarks(surfaces, [one[:count] for one in ids])
+    on_boundary = slice(matched.on_boundary)
+    np.testing.assert_allclose(matched.points[0][on_boundary], matched.points[1][on_boundary])
+    assert set(matched.numbers[on_boundary].tolist()) == set(range(count))
+
+
 def test_branches_leave_a_disc_and_meet_at_landmarks_only(pair):
     meshes, ids, _ = pair
     tracers = tracers_of([(m.vertices, m.faces) for m in meshes], ids)
