@@ -25,7 +25,8 @@ _FACES = 500
 _SPREAD = 6  # landmarks among which the four at the cones are chosen
 _ROUND = Round(0, 5, 30)
 _EXCHANGED = 8  # landmarks at most of which two are exchanged: pairs are many
-_STRAINED = 10.0  # energy of a strained map: then other cones are tried, and more is left out
+_STRAINED = 10.0  # energy of a strained map: then more is left out
+_ASTRAY = 12.0  # energy from which on a map may be of a wrong isotopy class: other cones are tried
 _GOOD = 7.0  # energy below which the map needs no change, whatever distances between landmarks say
 _SETS = 12  # sets of four at the cones that are tried, until a map is good
 _BETTER = 0.8  # share of the energy with the first set, from which on another one is taken
@@ -151,13 +152,14 @@ class _Maps:
         self.sets, first = quick_scores(source, np.sort(spread))
         scores = first + quick_scores(target, np.sort(spread))[1]
         self.sets = self.sets[np.argsort(scores)]
+        self.laid_out: dict[bytes, tuple[Layout, Layout, Table] | None] = {}
 
     def check(self) -> CoarseCheck | None:
         four, cones = self.sets[0], None
         found = self._trials(four)
         if found is None:
             return None
-        if found[1][0] > _STRAINED:
+        if found[1][0] > _ASTRAY:
             # cones tell the isotopy classes that are tried; the right one may not be among these
             with part("strongly distorted"):
                 other = self._better(found[1][0])
@@ -246,10 +248,10 @@ class _Maps:
 
     def _energies(self, four: np.ndarray, trials: list[_Trial]) -> list[float] | None:
         """The least energies of trials over isotopy classes, with cones at four landmarks."""
-        a, b = layout(self.source, four), layout(self.target, four)
-        if a is None or b is None:
+        layouts = self._layouts(four)
+        if layouts is None:
             return None
-        looked_up = table(b)
+        a, b, looked_up = layouts
         ways = {det: _starts(a, b, looked_up, det) for det in (1, -1)}
         number, found, drawn = [], [], []
         for k, trial in enumerate(trials):
@@ -267,6 +269,14 @@ class _Maps:
         for k, candidate in zip(number, after, strict=True):
             best[k] = min(best[k], candidate.energy)
         return best
+
+    def _layouts(self, four: np.ndarray) -> tuple[Layout, Layout, Table] | None:
+        """Both shapes laid out with cones at four landmarks, and the target's table."""
+        key = four.tobytes()
+        if key not in self.laid_out:
+            a, b = layout(self.source, four), layout(self.target, four)
+            self.laid_out[key] = None if a is None or b is None else (a, b, table(b))
+        return self.laid_out[key]
 
 
 def _starts(a: Layout, b: Layout, looked_up: Table, determinant: int) -> list[Candidate]:
