@@ -94,7 +94,7 @@ def test_the_line_names_landmark_and_vertices_also_where_others_are_missing():
 def test_other_cones_are_tried_where_the_map_is_not_good(right, monkeypatch):
     """With thresholds at which any other set is taken, the best of the others is."""
     assert right.cones is None
-    monkeypatch.setattr(module, "_STRAINED", 0.0)
+    monkeypatch.setattr(module, "_ASTRAY", 0.0)
     monkeypatch.setattr(module, "_BETTER", 10.0)
     monkeypatch.setattr(module, "_EXCHANGED", 0)
     monkeypatch.setattr(module, "_SETS", 3)
