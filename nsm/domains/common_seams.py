@@ -122,7 +122,9 @@ def with_nodes_between(tracers: Sequence[Tracer], pieces: int) -> list[Tracer]:
     for paths in zip(*(t.laid for t in tracers), strict=True):
         places = [_shares(t, path, pieces) for t, path in zip(tracers, paths, strict=True)]
         whole = any(len(set(at)) <= pieces for at in places)
-        parts.append([[0, len(p) - 1] if whole else at for p, at in zip(paths, places, strict=True)])
+        parts.append(
+            [[0, len(p) - 1] if whole else at for p, at in zip(paths, places, strict=True)]
+        )
     result = []
     for m, old in enumerate(tracers):
         ways = [(path, at[m]) for path, at in zip(old.laid, parts, strict=True)]

@@ -1,9 +1,9 @@
 """Cut a connected oriented manifold mesh of any topology open to a disc.
 
-The seam is a tree of shortest paths through the boundary loops and the seam vertices and, for
-handles, the shortest loops of a tree-cotree decomposition (Erickson and Whittlesey 2005, "Greedy
-optimal homotopy and homology generators"). The result is a disc by construction; this is checked
-nevertheless.
+The seam is a tree of shortest paths through the boundary loops, the seam vertices and the tips of
+limbs and, for handles, the shortest loops of a tree-cotree decomposition (Erickson and Whittlesey
+2005, "Greedy optimal homotopy and homology generators"). The result is a disc by construction; this
+is checked nevertheless.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
 from nsm.errors import NsmError
 from nsm.surfaces import topology
+from nsm.surfaces.limbs import limb_tips
 from nsm.wording import number_of
 
 FARTHEST_POINTS = 5
+_ROUNDS = 4  # of limbs that branch off other limbs
 _SEAM_KEY = "surface.seam_vertices"
 _DETOUR = 1000.0  # how many times its length an edge may cost to keep the seam off its ends
 # A boundary loop shorter than this times the square root of the area (a disc: 3.5, a hemisphere:
@@ -140,7 +142,7 @@ def cut_to_disc(
         vertices: (V, 3).
         faces: (F, 3), connected, oriented and manifold.
         seam_vertices: vertices that the seam visits; by default farthest points of a closed
-            surface, and of an almost closed one.
+            surface, and of an almost closed one, and tips of their limbs.
         avoided: vertices that the seam goes around where it can; those on boundaries do not count.
         name: of the mesh, for messages.
 
@@ -186,6 +188,10 @@ def disc_seam(
         log.append(f"seam through {number_of(len(farthest), 'farthest point')}")
 
     seam = _shortest_seam(graph, edges, terminals, genus)
+    if seam_vertices is None and almost_closed(vertices, faces, graph.loops):
+        seam, limbs = _led_into_limbs(graph, vertices, faces, seam)
+        if limbs:
+            log.append(f"seam led on to {number_of(limbs, 'tip')} of limbs")
     if seam:
         log.append(
             f"cut along {number_of(len(seam), 'edge')} (genus {genus}, "
@@ -269,6 +275,24 @@ def _allowed(graph: _Graph, distance: np.ndarray) -> np.ndarray:
     result = np.where(np.isfinite(distance), distance, -1.0)
     result[graph.avoided] = -1.0
     return result
+
+
+def _led_into_limbs(
+    graph: _Graph, vertices: np.ndarray, faces: np.ndarray, seam: list[int]
+) -> tuple[list[int], int]:
+    """The seam with branches to the tips of limbs that it does not reach, and their number."""
+    edges, count = set(seam), 0
+    for _ in range(_ROUNDS):
+        nodes = np.unique(graph.ends[sorted(edges)])
+        distance, predecessor = graph.distances(nodes.tolist())
+        distance[graph.avoided] = np.inf
+        tips = limb_tips(vertices, faces, distance[graph.node])
+        if not tips:
+            break
+        for tip in tips:
+            edges |= set(graph.path(predecessor, int(graph.node[tip]))[1])
+        count += len(tips)
+    return sorted(edges), count
 
 
 def _shortest_seam(
