@@ -123,6 +123,7 @@ class CollectionMap(ConstrainedMap):
         pairs, scale, share = self._scales()
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
+        self.distortion = energy.detach()
         # sums over the surfaces
         G = self._folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
@@ -330,5 +331,4 @@ class CollectionMap(ConstrainedMap):
     def landmark_error(self) -> Tensor:
         phis = batched(list(self.phis))
         units = self.targets.new_tensor(self.diagonals)[:, None]
-        every = 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)
-        return every[self.there]
+        return 100 / units * (phis(self(self.points)) - phis(self.targets)).norm(dim=-1)

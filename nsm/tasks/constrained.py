@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from nsm.settings import PairConstraints, PairWeights
 from nsm.tasks.at_triangles import AtTriangles
 from nsm.tasks.curvature import Curvature
 from nsm.tasks.fold_barrier import further_training, stronger
+from nsm.tasks.quasi_newton import QuasiNewton
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 
 # float32 places a point of the boundary no better than this
@@ -20,6 +22,9 @@ _ON_BOUNDARY = 1e-6
 _FIRST = 1e-3
 # factor of λ_C at triangles, where few steps are left to meet the landmarks
 _LAST = 10.0
+# relative change of the distortion in a quasi-Newton step, below which the next ones gain little
+_SETTLED = 1e-3
+_MET = 0.02  # in percent of the target's diagonal: landmarks that are nearer are met
 # in units of Ω: where there is a seam, a landmark that is farther off once λ_C is in full lies on
 # the other side of it; more force only folds the map
 _LOST = 0.1
@@ -40,8 +45,12 @@ class ConstrainedMap(AtTriangles):
     multipliers hold no landmark that is still far off, and where the steps at triangles begin, such
     a one is let go: it is missed, which figures tell, and the others are met without folds.
 
-    Subclasses set ``map``, call ``set_landmarks``, and define ``flipped_percent`` and
-    ``landmark_error``.
+    Quasi-Newton steps at triangles end where a step changes the distortion by less than 0.1 %, all
+    landmarks are met, and no fewer triangles are flipped than before it: maps of like shapes take
+    few.
+
+    Subclasses set ``map``, call ``set_landmarks``, keep the distortion of each evaluation in
+    ``distortion``, and define ``flipped_percent`` and ``landmark_error``.
 
     Args:
         domain: Ω (see :class:`nsm.domains.Domain`).
@@ -65,6 +74,9 @@ class ConstrainedMap(AtTriangles):
     boundary_samples: Tensor
     multipliers: Tensor
     lost: Tensor
+    reached: Tensor
+    flipped: Tensor
+    settled: Tensor
 
     def __init__(
         self,
@@ -82,6 +94,10 @@ class ConstrainedMap(AtTriangles):
         self.loss_terms = made_terms(loss_terms or {})
         self.held_out = HeldOut()
         self.weighed = 0.0  # λ_C of the step that is made
+        self.distortion: Tensor | None = None
+        self.register_buffer("reached", torch.tensor(math.inf))  # at the end of the last step
+        self.register_buffer("flipped", torch.tensor(math.inf))  # and then, in percent
+        self.register_buffer("settled", torch.tensor(False))
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
         # h maps Ω to itself by construction
@@ -163,8 +179,33 @@ class ConstrainedMap(AtTriangles):
             found.append(Curvature(h, ends, gap * first_fundamental_form(tangents)))
         return found
 
+    def on_train_start(self) -> None:
+        super().on_train_start()
+        if self.settled:  # as a resumed training may have been
+            self.trainer.should_stop = True
+
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
+        self._hold_landmarks()
+        optimizer = self.trainer.optimizers[0]
+        at_triangles = self.global_step > self.triangles_from
+        if at_triangles and isinstance(optimizer, QuasiNewton) and optimizer.on_last_level:
+            self._stop_if_settled()
+
+    def _stop_if_settled(self) -> None:
+        assert self.distortion is not None
+        with torch.no_grad():
+            change = (self.reached - self.distortion).abs() / self.distortion.abs()
+            met = bool((self.landmark_error()[self.held] < _MET).all()) if len(self.points) else True
+            flipped = self.flipped_percent()
+        fewer = bool(flipped < self.flipped)
+        self.reached, self.flipped = self.distortion.detach().to(self.reached), flipped
+        if change < _SETTLED and met and not fewer:
+            self.settled.fill_(True)
+            self.trainer.should_stop = True
+
+    def _hold_landmarks(self) -> None:
+        """Let landmarks go that no force meets, and raise the multipliers of the others."""
         settings = self.constraints
         if not len(self.points) or self.ramp < 1:
             return
@@ -187,13 +228,17 @@ class ConstrainedMap(AtTriangles):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
-        checkpoint["state_dict"].setdefault("lost", self.lost)  # an earlier version's lets none go
+        for name in ("lost", "reached", "flipped", "settled"):  # an earlier version's are as they are at first
+            checkpoint["state_dict"].setdefault(name, getattr(self, name))
 
     def strengthen(self, steps: int) -> None:
         """Prepare a further training of a nearly injective map: the ramp is over, the weight of
         folding triangles is ten times as large and acts on more of them, in small steps."""
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
+        for reached in (self.reached, self.flipped):
+            reached.fill_(math.inf)
+        self.settled.fill_(False)
         further_training(self, steps)
 
     def log_validation(self, distortion: Distortion, evaluation: Evaluation) -> None:
@@ -212,7 +257,7 @@ class ConstrainedMap(AtTriangles):
         self.log("val/distortion_median", self.held_out.median())
         self.log("val/flipped_percent", self.flipped_percent())
         if len(self.points):
-            error = self.landmark_error()
+            error = self.landmark_error()[self.there]
             self.log("val/landmark_error_mean_percent", error.mean())
             self.log("val/landmark_error_max_percent", error.max())
 
@@ -221,5 +266,6 @@ class ConstrainedMap(AtTriangles):
         raise NotImplementedError
 
     def landmark_error(self) -> Tensor:
-        """Distance of landmarks from their targets, on the surface, in percent of its diagonal."""
+        """Distances (..., K) of landmarks from their targets, on the surface, in percent of its
+        diagonal."""
         raise NotImplementedError

@@ -95,6 +95,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         w, ramp = self.loss_weights, self.ramp
         distortion, evaluation = self._evaluated(batch)
         energy = distortion.mean
+        self.distortion = energy.detach()
         G = self._folding(evaluation)
         B = 0.0 if self.exact else self._boundary_term(evaluation.image)
         S = self._seam_gap() if len(self.seam) and w.seam > 0 else 0.0

@@ -115,6 +115,11 @@ class QuasiNewton(Optimizer):
         self.curvatures, self.turns = curvatures, turns
 
     @property
+    def on_last_level(self) -> bool:
+        """Whether the steps of all coarser levels have been made."""
+        return bool(self.state[self.fields[0].coefficients]["step"] >= sum(self.counts))
+
+    @property
     def converged(self) -> bool:
         """Whether the last step was one of the last level and hardly changed the loss."""
         return bool(self.state[self.fields[0].coefficients].get("converged", False))
