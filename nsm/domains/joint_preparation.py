@@ -108,8 +108,7 @@ def prepare_jointly(
     enough = everywhere.sum() >= 2 if domain.has_boundary else len(distinct(common_ids)) >= 4
     apart = (seam == "own" and domain.has_boundary) or len(meshes) == 1
     kinds = [topology.genus_and_boundary(c.faces) for c in cleaned]
-    common = check_common_topology([m.name for m in meshes], kinds)
-    genus, loops = common
+    genus, loops = check_common_topology([m.name for m in meshes], kinds)
     several = (
         domain.has_boundary
         and loops > 0
@@ -120,20 +119,9 @@ def prepare_jointly(
     if apart or not (several or alike):
         # apart, seams cannot pass one landmark in corresponding places
         inside = landmarks if apart else [np.zeros(0, np.int64)] * len(meshes)
-
-        def alone(m: Mesh, ids: np.ndarray) -> Surface:
-            return Surface.from_arrays(
-                m.vertices,
-                m.faces,
-                name=m.name,
-                domain=domain,
-                parameterization=parameterization,
-                cache=cache,
-                log=m.log,
-                repairs=m.decided(repairs),
-                off_seam=ids[ids >= 0].tolist(),
-            )
-
+        alone = partial(
+            _alone, domain=domain, method=parameterization, cache=cache, repairs=repairs
+        )
         return _laid_out(alone, list(zip(meshes, inside, strict=True)), processes)
     together = _digest(cleaned, found)
     options = {
@@ -149,9 +137,16 @@ def prepare_jointly(
     surfaces = _stored(meshes, domain, keys) if cache else None
     if surfaces is None:
         if domain.has_boundary:
-            how = (seam, seam_landmarks, int(together[:15], 16))
             one, parts = _cut_alike(
-                meshes, cleaned, found, everywhere, domain, parameterization, *how
+                meshes,
+                cleaned,
+                found,
+                everywhere,
+                domain,
+                parameterization,
+                seam,
+                seam_landmarks,
+                number=int(together[:15], 16),
             )
         else:
             four = None if cones is None else (np.cumsum(everywhere) - 1)[list(cones)].tolist()
@@ -166,6 +161,23 @@ def prepare_jointly(
         replace(surface, raw=(m.vertices, m.faces))
         for m, surface in zip(meshes, surfaces, strict=True)
     ]
+
+
+def _alone(
+    mesh: Mesh, around: np.ndarray, *, domain: Domain, method: str, cache: bool, repairs: Repairs
+) -> Surface:
+    """The surface of a mesh that is prepared by itself, its seam led around vertices (L,)."""
+    return Surface.from_arrays(
+        mesh.vertices,
+        mesh.faces,
+        name=mesh.name,
+        domain=domain,
+        parameterization=method,
+        cache=cache,
+        log=mesh.log,
+        repairs=mesh.decided(repairs),
+        off_seam=around[around >= 0].tolist(),
+    )
 
 
 def _digest(cleaned: Sequence[CleanMesh], landmarks: Sequence[np.ndarray]) -> str:
