@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from formula_shapes import NAMES, Shape, made, symmetries
+from maps import FROM_START, table
 from scipy.spatial import cKDTree
 
 from nsm.correspondence.distances import edge_distances
@@ -45,12 +46,7 @@ WRONG = 0.15
 LIMIT = 600  # seconds of a command
 COLUMNS = {
     "given": "landmarks",
-    "start_symmetric_dirichlet_median": "median as h starts",
-    "symmetric_dirichlet_median": "median",
-    "symmetric_dirichlet_mean": "mean",
-    "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_before_repair_percent": "flipped % before repair",
-    "flipped_percent": "flipped %",
+    **FROM_START,
     "landmark_error_max_percent": "landmarks missed, %",
     "seam_gap_max_percent": "seam gap, largest",
     "certified": "certified",
@@ -162,24 +158,23 @@ def write(lines: list[dict[str, Any]]) -> None:
         "seconds, most": max(line["seconds"] for line in lines),
     }
     RESULT.write_text(json.dumps({"summary": summary, "cases": lines}, indent=1) + "\n")
-    heads = ["class", "row", *COLUMNS.values()]
-    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    rows = []
     order = {(n, r): k for k, (n, r) in enumerate((n, r) for r in ROWS for n in NAMES)}
     for line in sorted(lines, key=lambda one: order[one["class"], one["row"]]):
-        cells = [line["class"], line["row"], *(shown(line, key) for key in COLUMNS)]
-        rows.append(f"| {' | '.join(cells)} |")
-    RESULT.with_suffix(".md").write_text("\n".join([*rows, "", *by_class(lines)]) + "\n")
+        rows.append([line["class"], line["row"], *(shown(line, key) for key in COLUMNS)])
+    every = table(["class", "row", *COLUMNS.values()], rows)
+    RESULT.with_suffix(".md").write_text(f"{every}\n\n{by_class(lines)}\n")
     print(json.dumps(summary))
 
 
-def by_class(lines: list[dict[str, Any]]) -> list[str]:
+def by_class(lines: list[dict[str, Any]]) -> str:
     """The table of docs/maps.md: each class with many landmarks, and with none."""
     heads = [
         *("class", "landmarks", "median as h starts", "median", "95th percentile"),
         *("flipped % before repair", "landmarks missed, %", "certified", "error"),
         *("error, none given", "told as unsure", "seconds, given and none"),
     ]
-    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    rows = []
     of = {(line["class"], line["row"]): line for line in lines}
     digits = {
         "start_symmetric_dirichlet_median": 2,
@@ -196,9 +191,8 @@ def by_class(lines: list[dict[str, Any]]) -> list[str]:
         alone = [shown(none, key) for key in ("error", "told")]
         seconds = f"{shown(given, 'seconds')}, {shown(none, 'seconds')}"
         certified, error = shown(given, "certified"), shown(given, "error")
-        cells = [name, str(given["given"]), *figures, certified, error, *alone, seconds]
-        rows.append(f"| {' | '.join(cells)} |")
-    return rows
+        rows.append([name, str(given["given"]), *figures, certified, error, *alone, seconds])
+    return table(heads, rows)
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from maps import ANIMALS, table, timed
+from maps import ANIMALS, FROM_START, table, timed
 
 import nsm
 
@@ -184,12 +184,7 @@ def shapes(meshes: Path, numbers: Sequence[str], ending: str) -> tuple[list[str]
 
 
 COLUMNS = {
-    "start_symmetric_dirichlet_median": "median as h starts",
-    "symmetric_dirichlet_median": "median",
-    "symmetric_dirichlet_mean": "mean",
-    "symmetric_dirichlet_p95": "95th percentile",
-    "flipped_before_repair_percent": "flipped % before repair",
-    "flipped_percent": "flipped %",
+    **FROM_START,
     "landmark_error_max_percent": "landmark error, largest %",
     "seam_gap_max_percent": "torn by at most %",
     "map_seconds": "seconds",

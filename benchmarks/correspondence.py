@@ -11,7 +11,7 @@ Rows: ``none``: no landmarks; ``given N``: the N annotated landmarks that are fa
 other, completed by proposals; ``..., full map``: the map that the default settings train, which is
 what a user gets; ``zoomout``: wave kernel signatures and ZoomOut; ``icp``: the best of 24 rotations
 with iterated closest points, then ZoomOut. The last two are pyfmaps' (nsm[peers]), on meshes of
-3,000 triangles.
+3,000 triangles; without that package they are left out.
 
 Each figure is kept as a line of benchmarks/results/correspondence.jsonl, so that the benchmark goes
 on where it stopped; without that file it begins anew. Writes correspondence.json beside it and
@@ -24,9 +24,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -258,8 +260,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", type=Path, default=Path("meshes"), help="folder of the meshes")
     parser.add_argument("--pairs", type=int, help="so many pairs of the animals; all by default")
-    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), help="which rows")
+    parser.add_argument("--rows", nargs="+", choices=ROWS, help="which rows; all by default")
     given = parser.parse_args()
+    rows = list(given.rows or ROWS)
+    if find_spec("pyFM") is None and not PEERS.keys().isdisjoint(rows):
+        line = f"rows {', '.join(PEERS)} need pyfmaps, which pip install '.[peers]' installs"
+        if given.rows:
+            parser.exit(2, f"{line}; or take other --rows\n")
+        print(f"{line}; they are left out", file=sys.stderr)
+        rows = [row for row in rows if row not in PEERS]
     torch.set_num_threads(1)
     animals = sorted(
         file.stem
@@ -271,7 +280,7 @@ def main() -> None:
     lines = [json.loads(line) for line in LINES.read_text().splitlines()] if LINES.exists() else []
     done = {(line["row"], line["source"], line["target"]) for line in lines}
     shapes: dict[str, Annotated] = {}
-    for row in given.rows:
+    for row in rows:
         for kind, pairs in sets.items():
             for pair in pairs:
                 if (row, *pair) in done:

@@ -183,14 +183,15 @@ COLUMNS = {
     "seam_gap_mean_percent": "seam gap, mean",
     "covered_percent": "covered %",
 }
-FLAT = {
+AT_END = {
     "symmetric_dirichlet_median": "median",
     "symmetric_dirichlet_mean": "mean",
     "symmetric_dirichlet_p95": "95th percentile",
     "flipped_before_repair_percent": "flipped % before repair",
     "flipped_percent": "flipped %",
-    "boundary_self_intersections": "overlaps of the boundary",
 }
+FROM_START = {"start_symmetric_dirichlet_median": "median as h starts", **AT_END}
+FLAT = {**AT_END, "boundary_self_intersections": "overlaps of the boundary"}
 
 
 LEAST = "Distortion D_iso is symmetric Dirichlet: 3.98 = 4 - 2ε at best, ε = 0.01."

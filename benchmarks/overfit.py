@@ -53,16 +53,8 @@ def _paper(surface: Surface, minutes: list[float]) -> dict[float, dict[str, Any]
         }
         module.map.train()
 
-    settings = config.trainer
-    watch = GradientWatch(
-        settings.log_every,
-        settings.stop_gradient_norm,
-        settings.stop_window,
-        summed=settings.stop_norm_of == "sum",
-    )
-    trainer, module, seconds = train(
-        config, surface, [Clock([60 * m for m in minutes], at_mark), watch]
-    )
+    clock, watch = Clock([60 * m for m in minutes], at_mark), GradientWatch.of(config.trainer)
+    trainer, module, seconds = train(config, surface, [clock, watch])
     for m in minutes:  # the stopping rule ended the training before that time
         found.setdefault(
             m,

@@ -135,12 +135,7 @@ def trained(
         module.to(place).train()
 
     settings = config.trainer
-    watch = GradientWatch(
-        settings.log_every,
-        settings.stop_gradient_norm,
-        settings.stop_window,
-        summed=settings.stop_norm_of == "sum",
-    )
+    watch = GradientWatch.of(settings)
     clock = Clock([when, math.inf], at_mark, form.seconds)
     trainer, module, _ = train(
         config, surface, [clock, watch], inputs=inputs, accelerator=form.accelerator

@@ -41,7 +41,7 @@ STAGES = (
     ("nsm.domains.surface", "given_mesh", "reading"),
     ("nsm.pipeline.automatic_domain", "clean", "cleaning"),
     ("nsm.domains.joint_preparation", "clean", "cleaning"),
-    ("nsm.domains.surface", "clean", "cleaning"),
+    ("nsm.domains.preparation", "clean", "cleaning"),
     ("nsm.pipeline.resolve_inputs", "prepare_jointly", "layout on the domain"),
     ("nsm.domains.surface:Surface", "load", "layout on the domain"),
     ("nsm.pipeline.overfit", "fit_linear_skip", "φ: least-squares fit"),

@@ -10,6 +10,7 @@ import pytest
 from nsm.surfaces import shapes
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+import correspondence  # noqa: E402
 import peers  # noqa: E402
 
 SCRIPT = """
@@ -88,3 +89,25 @@ def test_without_a_command_the_peer_is_skipped(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", words)
     peers.main()
     assert "theirs: skipped, as there is no --command" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("rows, status", [(["--rows", "none", "icp"], 2), ([], 0)])
+def test_correspondences_without_pyfmaps_say_so_first(tmp_path, monkeypatch, capsys, rows, status):
+    """Rows that were asked for stop it; by default the others are measured."""
+    monkeypatch.setattr(correspondence, "find_spec", lambda _: None)
+    measured = []
+    shape = correspondence.Annotated(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    monkeypatch.setattr(correspondence, "annotated", lambda *_: shape)
+    monkeypatch.setattr(correspondence, "measured", lambda row, *_: measured.append(row) or {})
+    monkeypatch.setattr(correspondence, "write", lambda _: None)
+    monkeypatch.setattr(correspondence, "LINES", tmp_path / "lines.jsonl")
+    monkeypatch.setattr(sys, "argv", ["correspondence.py", "--meshes", str(tmp_path), *rows])
+    try:
+        correspondence.main()
+        ended = 0
+    except SystemExit as stop:
+        ended = stop.code
+    said = capsys.readouterr().err.splitlines()
+    assert ended == status and len(said) == 1
+    assert "pyfmaps" in said[0] and "pip install '.[peers]'" in said[0]
+    assert set(measured) == (set() if status else {"none", "none, full map"})

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,22 +16,18 @@ from scipy.sparse.csgraph import connected_components
 
 from nsm.domains.base import Domain, Keys
 from nsm.domains.caps import without_caps
-from nsm.domains.embedding import GIVEN, check_method
-from nsm.domains.given_layout import check_given, cut_as_given, embedded_as_given, in_units_of
-from nsm.domains.names import bounded
+from nsm.domains.embedding import GIVEN
+from nsm.domains.laid_out import closed_laid_out, cut_laid_out
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
-from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
+from nsm.domains.preparation import Preparation, vertex_numbers
 from nsm.errors import NsmError
 from nsm.surfaces import cache as cache_
 from nsm.surfaces import holes, topology
-from nsm.surfaces.cutting import Cut, chords_joined, cut_to_disc, first_copies, seam_pairs
+from nsm.surfaces.cutting import Cut, chords_joined, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
-from nsm.surfaces.landmarks import listed
-from nsm.surfaces.loading import as_arrays
 from nsm.surfaces.textures import read_uv
-from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs, clean
-from nsm.wording import number_of
+from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 OPTIONAL = ("lattice", "ends", "caps", "given_uv")
@@ -177,61 +172,27 @@ class Surface:
                 ``wrong_topology`` for a closed domain of another topology; ``wrong_domain`` for
                 ``seam_vertices`` or ``cones`` where the domain has none.
         """
-        domain = domain_of(domain)
-        check_method(parameterization, name)
-        vertices, faces = as_arrays(vertices, faces, name)
-        seam = None if seam_vertices is None else _numbers(seam_vertices, f"{name}: seam_vertices")
-        corners = None if cones is None else _numbers(cones, f"{name}: cones")
-        unused, key = (corners, "cones") if domain.has_boundary else (seam, "seam_vertices")
-        if unused is not None:
-            raise NsmError(
-                f"{name}: domain={domain} has no {key.split('_')[0].rstrip('s')}; leave "
-                f"surface.{key} out",
-                kind="wrong_domain",
-                key=f"surface.{key}",
-            )
-        options = {"domain": stored_domain(domain), "seam": seam, "method": parameterization}
-        if corners is not None:
-            options["cones"] = corners
-        inside = [int(v) for v in off_seam] if domain.has_boundary else []
-        if inside:
-            options["off_seam"] = inside
-        if repairs != NO_DECISION:
-            options["repairs"] = asdict(repairs)
-        if parameterization == GIVEN:
-            given_uv = check_given(uv, faces, domain, seam, name)
-            options["given_uv"] = hashlib.sha256(given_uv.tobytes()).hexdigest()
-        key = cache_.preparation_key(vertices, faces, options) if cache else ""
+        asked = Preparation.checked(
+            vertices,
+            faces,
+            name=name,
+            domain=domain,
+            method=parameterization,
+            seam_vertices=seam_vertices,
+            cones=cones,
+            off_seam=off_seam,
+            repairs=repairs,
+            uv=uv,
+        )
+        key = asked.key() if cache else ""
         stored = cache_.read(key) if cache else None
-        raw = (vertices, faces)
         if stored is not None:
-            return replace(cls.from_stored(name, domain, stored), raw=raw)
-        mesh = clean(vertices, faces, name, repairs)
-        about: dict[str, Any] = {
-            "name": name,
-            "domain": domain,
-            "parameterization": parameterization,
-            "log": (*log, *mesh.log),
-        }
-        if parameterization == GIVEN:
-            assert uv is not None
-            cut, flat = cut_as_given(mesh, faces, uv, name)
-            surface = cls.from_cut(cut, mesh, **about, given=flat)
-        elif domain.has_boundary:
-            if seam is not None:
-                seam = _merged(seam, mesh, name, "seam_vertices")
-            around = _merged(inside, mesh, name, "off_seam")
-            cut = cut_to_disc(
-                mesh.vertices, mesh.faces, seam_vertices=seam, avoided=around, name=name
-            )
-            surface = cls.from_cut(cut, mesh, **about)
+            surface = cls.from_stored(name, asked.domain, stored)
         else:
-            if corners is not None:
-                corners = _merged(corners, mesh, name, "cones")
-            surface = cls.from_closed(mesh, cones=corners, **about)
-        if cache:
-            cache_.write(key, surface.to_stored())
-        return replace(surface, raw=raw)
+            surface = cls(**asked.fields(log))
+            if cache:
+                cache_.write(key, surface.to_stored())
+        return replace(surface, raw=(asked.vertices, asked.faces))
 
     @classmethod
     def from_cut(
@@ -258,51 +219,17 @@ class Surface:
         Raises:
             NsmError: the mesh cannot be flattened without flips.
         """
-        start = time.perf_counter()
-        domain = domain_of(domain)
-        centred, center, scale = _centred(cut.vertices, cut.faces, domain)
-        normalised = centred * scale
-        if given is None:
-            how: dict[str, Any] = {"method": parameterization, "name": name, "keys": keys}
-            flat = domain.embed(normalised, cut.faces, **how)
-        else:
-            flat = embedded_as_given(bounded(domain), cut, given, name)
-            given = in_units_of(bounded(domain), given, cut.faces)
-        flipped = flipped_triangles(flat.uv, cut.faces)
-        crossings = boundary_self_intersections(flat.uv, cut.loop) if domain.has_boundary else 0
-        if flipped or crossings:
-            faults = f"{number_of(flipped, 'flipped triangle')}, "
-            faults += number_of(crossings, "boundary crossing")
-            raise NsmError(
-                f"{name}: the parameterization is not injective ({faults}); give "
-                "seam_vertices at the tips of long parts",
-                kind="not_injective",
-                key=name,
-            )
-        source = np.where(cut.origin >= 0, mesh.source_vertex[cut.origin], -1)
-        first = first_copies(cut.origin, len(mesh.vertices))
-        quality = {
-            "flipped_triangles": float(flipped),
-            "boundary_self_intersections": float(crossings),
-            "median_symmetric_dirichlet": flat.distortion,
-            "tutte_median_symmetric_dirichlet": flat.tutte_distortion,
-            "seam_vertices": float(len(cut.seam_pairs)),
-            "seconds": time.perf_counter() - start,
-        }
         return cls(
-            name=name,
-            vertices=normalised,
-            faces=cut.faces,
-            uv=flat.uv,
-            domain=domain,
-            source_vertex=source,
-            cut_vertex=np.where(mesh.merged >= 0, first[mesh.merged], -1),
-            seam_pairs=cut.seam_pairs,
-            scale=scale,
-            center=center,
-            quality=quality,
-            log=(*log, *cut.log, *flat.log),
-            given_uv=given,
+            **cut_laid_out(
+                cut,
+                mesh,
+                name=name,
+                domain=domain_of(domain),
+                parameterization=parameterization,
+                log=log,
+                keys=keys,
+                given=given,
+            )
         )
 
     @classmethod
@@ -326,37 +253,15 @@ class Surface:
         Raises:
             NsmError: see :meth:`nsm.domains.orbifold.domain.ClosedDomain.embed`.
         """
-        start = time.perf_counter()
-        domain = domain_of(domain)
-        centred, center, scale = _centred(mesh.vertices, mesh.faces, domain)
-        flat = domain.embed(
-            centred * scale, mesh.faces, method=parameterization, name=name, keys=cones
-        )
-        origin, uv, faces = flat.copies()
-        first = first_copies(origin, len(mesh.vertices))
-        quality = {
-            "flipped_triangles": float(flipped_triangles(uv, faces)),
-            "median_symmetric_dirichlet": float(np.median(flat.distortions(centred))),
-            "seconds": time.perf_counter() - start,
-        }
-        chosen: tuple[str, ...] = ()
-        if flat.cones is not None:
-            chosen = (f"cones at vertices {mesh.source_vertex[flat.cones].tolist()}",)
         return cls(
-            name=name,
-            vertices=(centred * scale)[origin],
-            faces=faces,
-            uv=uv,
-            domain=domain,
-            source_vertex=mesh.source_vertex[origin],
-            cut_vertex=np.where(mesh.merged >= 0, first[mesh.merged], -1),
-            seam_pairs=seam_pairs(origin),
-            scale=scale,
-            center=center,
-            quality=quality,
-            log=(*log, *chosen),
-            lattice=flat.lattice * np.sqrt(domain.area / flat.area),
-            caps=mesh.caps,
+            **closed_laid_out(
+                mesh,
+                name=name,
+                domain=domain_of(domain),
+                parameterization=parameterization,
+                log=log,
+                cones=cones,
+            )
         )
 
     def to_stored(self) -> dict[str, np.ndarray]:
@@ -488,7 +393,7 @@ class Surface:
         return self.source_vertex[self._found(vertex_ids)]
 
     def _found(self, vertex_ids: Sequence[int]) -> np.ndarray:
-        numbers = _numbers(vertex_ids, f"{self.name}: vertices")
+        numbers = vertex_numbers(vertex_ids, f"{self.name}: vertices")
         for vertex in numbers:
             if not 0 <= vertex < len(self.cut_vertex) or self.cut_vertex[vertex] < 0:
                 raise NsmError(
@@ -498,17 +403,6 @@ class Surface:
                     key=self.name,
                 )
         return self.cut_vertex[np.array(numbers, dtype=np.int64)]
-
-
-def _centred(
-    vertices: np.ndarray, faces: np.ndarray, domain: Domain
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Vertices (V, 3) about the middle of their bounding box, that middle (3,), and the scale by
-    which the mesh gets the area of Ω."""
-    center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    centred = vertices - center
-    area = float(topology.face_areas(centred, faces).sum())
-    return centred, center, float(np.sqrt(domain.area / area))
 
 
 def as_it_lies(
@@ -541,24 +435,3 @@ def as_it_lies(
         center=np.zeros(3),
         lattice=lattice,
     )
-
-
-def _numbers(given: Any, what: str) -> list[int]:
-    """Vertex numbers; NsmError for anything but a list of whole numbers."""
-    numbers = listed(given, what)
-    if not isinstance(numbers, list):
-        raise NsmError(f"{what}: give vertex numbers", kind="wrong_type", key=what)
-    return numbers
-
-
-def _merged(given: list[int], mesh: CleanMesh, name: str, key: str) -> list[int]:
-    """Vertices of the mesh file as vertices of the cleaned mesh, or NsmError."""
-    for vertex in given:
-        if not 0 <= vertex < len(mesh.merged) or mesh.merged[vertex] < 0:
-            raise NsmError(
-                f"{name}: vertex {vertex} is not on the mesh "
-                f"(vertices 0 to {len(mesh.merged) - 1}); give other {key}",
-                kind="not_on_surface",
-                key=key,
-            )
-    return mesh.merged[np.array(given, dtype=np.int64)].tolist()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nsm.energies.numerics import narrow, widen
+from nsm.energies.squared_distance import squared_distance
 
 STEEPEST = 20.0  # the injectivity term grows as exp until det = −STEEPEST, then linearly
 
@@ -109,8 +110,4 @@ def landmark(points: Tensor, targets: Tensor) -> Tensor:
     Raises:
         ValueError: the shapes differ.
     """
-    if points.shape != targets.shape:
-        raise ValueError(
-            f"landmarks {tuple(points.shape)} and their targets {tuple(targets.shape)} differ"
-        )
-    return narrow(((widen(points) - widen(targets)) ** 2).sum(dim=-1), points.dtype)
+    return squared_distance(points, targets, "landmarks")

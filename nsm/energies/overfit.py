@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from nsm.energies.numerics import narrow, widen
+from nsm.energies.squared_distance import squared_distance
 
 # Under the root of ‖∂φ/∂u × ∂φ/∂v‖²: an area element under 1e-6 is a collapsed one, whose normal
 # fades to zero; one of 1e-3 or more is altered by at most 5e-7 of itself.
@@ -24,11 +25,7 @@ def position(predicted: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: the shapes differ.
     """
-    if predicted.shape != target.shape:
-        raise ValueError(
-            f"positions {tuple(predicted.shape)} and their targets {tuple(target.shape)} differ"
-        )
-    return narrow(((widen(predicted) - widen(target)) ** 2).sum(dim=-1), predicted.dtype)
+    return squared_distance(predicted, target, "positions")
 
 
 def normal(jacobian: Tensor, target_normal: Tensor) -> Tensor:

@@ -10,11 +10,7 @@ from torch import Tensor, nn
 from nsm.instantiation import target_of
 from nsm.maps.encodings import Identity, pushed_forward, transformed
 from nsm.maps.lattice_grid import LatticeSplineGrid
-
-_LEAST = 4  # cells
-# A coefficient is its parameter times this over √cells: the rate of feature grids behind a network
-# then suits, and a step of a fine level does not change slopes much more than that of a coarse one.
-_SCALE = 0.5
+from nsm.maps.two_scale import level_cells, level_scale, refined
 
 
 class MultilevelSpline(nn.Module):
@@ -35,14 +31,11 @@ class MultilevelSpline(nn.Module):
 
     def __init__(self, out_dim: int = 2, cells: int = 128, odd: bool = False) -> None:
         super().__init__()
-        if out_dim < 1 or cells < _LEAST or cells % 2:
+        if out_dim < 1 or cells < 4 or cells % 2:
             raise ValueError("map.cells must be even and 4 or more, and out_dim positive")
         self.out_dim, self.cells, self.odd = int(out_dim), int(cells), bool(odd)
-        sides = [self.cells]
-        while sides[0] % 2 == 0 and sides[0] // 2 >= _LEAST:
-            sides.insert(0, sides[0] // 2)
         self.tables = nn.ParameterList(
-            nn.Parameter(torch.zeros(side, side, self.out_dim)) for side in sides
+            nn.Parameter(torch.zeros(n, n, self.out_dim)) for n in level_cells(self.cells)
         )
         self._finest = LatticeSplineGrid([(self.cells, self.cells)], self.out_dim)
         self._finest.tables = nn.ParameterList()
@@ -59,10 +52,10 @@ class MultilevelSpline(nn.Module):
 
     def coefficients(self) -> Tensor:
         """(cells², ``out_dim``) of the sum of all levels, on the finest grid."""
-        levels = [_SCALE / len(table) ** 0.5 * table for table in self.tables]
+        levels = [level_scale(len(table)) * table for table in self.tables]
         c = levels[0]
         for finer in levels[1:]:
-            c = _refined(_refined(c, 0), 1) + finer
+            c = refined(refined(c, 0), 1) + finer
         if self.odd:
             c = 0.5 * (c - c.flip(0, 1))  # x → -x takes cell i to cells - 1 - i
         return c.flatten(0, 1)
@@ -92,11 +85,3 @@ class MultilevelSpline(nn.Module):
 def _along(weights: list[Tensor], axis: int) -> Tensor:
     """The weights (k, N) along an axis, of one level."""
     return torch.stack([w[0, axis] for w in weights])
-
-
-def _refined(c: Tensor, axis: int) -> Tensor:
-    """Coefficients of the same periodic spline for cells half as long along an axis."""
-    near = 0.75 * c
-    first = near + 0.25 * c.roll(1, axis)
-    second = near + 0.25 * c.roll(-1, axis)
-    return torch.stack([first, second], dim=axis + 1).flatten(axis, axis + 1)

@@ -15,7 +15,8 @@ import torch
 from rich.text import Text
 
 from nsm.data import CollectionData, SurfaceData
-from nsm.domains.joint_preparation import Matched, Mesh, matched_landmarks, with_ends
+from nsm.domains.joint_preparation import Mesh
+from nsm.domains.matched_landmarks import Matched, matched_landmarks, with_ends
 from nsm.domains.orbifold.collection_alignment import alignments_to_first, disagreements
 from nsm.instantiation import named_object, target_of
 from nsm.maps import LatticeAligned, Rotated

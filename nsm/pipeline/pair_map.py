@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nsm.data import SurfaceData
-from nsm.domains.joint_preparation import matched_landmarks, with_ends
+from nsm.domains.matched_landmarks import matched_landmarks, with_ends
 from nsm.domains.orbifold.alignment import Alignment, alignments
 from nsm.errors import NsmError
 from nsm.maps import AnalyticSurface, LatticeAligned, Remembered, Rotated

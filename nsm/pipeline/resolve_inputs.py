@@ -11,14 +11,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from nsm.domains import Domain, Surface, domain
-from nsm.domains.joint_preparation import (
-    Mesh,
-    check_common_topology,
-    cut_together,
-    matched_landmarks,
-    prepare_jointly,
-    with_ends,
-)
+from nsm.domains.joint_preparation import Mesh, check_common_topology, prepare_jointly
+from nsm.domains.matched_landmarks import cut_together, matched_landmarks, with_ends
 from nsm.errors import NsmError
 from nsm.maps import ANALYTIC, AnalyticSurface
 from nsm.pipeline.configured_surface import configured_repairs, report_surface

@@ -156,22 +156,8 @@ def run_parts(task: Task, parts: list[Task], run: Run, started: float) -> Any:
     result = task.joined(results)
     task.measure(result)
     task.save(run.folder, result)
-    warnings = task.warnings(result)
-    _print_figures(task, run, result, warnings, time.monotonic() - started)
-    if task.config.artefacts:
-        with stage(task.console, f"{task.title}: pictures and meshes"):
-            task.write_artefacts(run.folder, result)
-    summary = {
-        "surface": task.surface.name,
-        "steps": steps,
-        "seconds": round(time.monotonic() - started, 2),
-        **task.figures(result),
-        "warnings": [warning.plain for warning in warnings],
-        "metrics": result.metrics,
-    }
-    atomic_write(run.folder / "metrics.json", as_json(summary))
-    if not is_temporary(run.folder):
-        task.console.print(f"results in {run.folder}", soft_wrap=True)
+    warnings = _shown(task, run, result, started)
+    _complete(task, run, result, started, steps, task.figures(result), warnings)
     return result
 
 
@@ -235,31 +221,49 @@ def finish(
     with stage(task.console, f"{task.title}: figures"):
         task.measure(result)
         task.save(run.folder, result)
-    warnings = task.warnings(result)
-    _print_figures(task, run, result, warnings, time.monotonic() - started)
-    if task.config.artefacts:
-        with stage(task.console, f"{task.title}: pictures and meshes"):
-            task.write_artefacts(run.folder, result)
+    warnings = _shown(task, run, result, started)
     ensemble = trainer.lightning_module
     if isinstance(ensemble, Ensemble):
         figures["batched"] = len(ensemble.each)
     loggers = loggers_of(trainer.loggers, index)
     log_figures(loggers, task.settings, result.metrics, trainer.global_step)
+    about = {"preparation": task.surface.quality, "faults": guard_of(trainer)}
+    about = {**about, **task.figures(result), **figures}
+    _complete(task, run, result, started, trainer.global_step, about, warnings)
+    return result
+
+
+def _shown(task: Task, run: Run, result: Any, started: float) -> Sequence[Text]:
+    """Print a result's figures and write its pictures and meshes; the warnings on it."""
+    warnings = task.warnings(result)
+    _print_figures(task, run, result, warnings, time.monotonic() - started)
+    if task.config.artefacts:
+        with stage(task.console, f"{task.title}: pictures and meshes"):
+            task.write_artefacts(run.folder, result)
+    return warnings
+
+
+def _complete(
+    task: Task,
+    run: Run,
+    result: Any,
+    started: float,
+    steps: int,
+    about: Mapping[str, Any],
+    warnings: Sequence[Text],
+) -> None:
+    """Write metrics.json, with more ``about`` the run, and say where the results are."""
     summary = {
         "surface": task.surface.name,
-        "steps": trainer.global_step,
+        "steps": steps,
         "seconds": round(time.monotonic() - started, 2),
-        "preparation": task.surface.quality,
-        "faults": guard_of(trainer),
-        **task.figures(result),
-        **figures,
+        **about,
         "warnings": [warning.plain for warning in warnings],
         "metrics": result.metrics,
     }
     atomic_write(run.folder / "metrics.json", as_json(summary))
     if not is_temporary(run.folder) and not run.inner:
         task.console.print(f"results in {run.folder}", soft_wrap=True)
-    return result
 
 
 def _print_figures(

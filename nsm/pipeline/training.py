@@ -148,12 +148,7 @@ def trained(
     guard = DivergenceGuard(console)
     callbacks: list[Callback] = [
         guard,
-        GradientWatch(
-            settings.log_every,
-            settings.stop_gradient_norm,
-            settings.stop_window,
-            summed=settings.stop_norm_of == "sum",
-        ),
+        GradientWatch.of(settings),
         AtomicCheckpoint(*(run.folder / CHECKPOINT_FILE for run in runs)),
         *_own_callbacks(config),
     ]

@@ -19,6 +19,7 @@ from nsm.errors import NsmError
 from nsm.results.files import flush_folder
 from nsm.results.loggers import event_files, log_picture, loggers_of, takes_pictures
 from nsm.results.meshes import ColouredMesh
+from nsm.settings import TrainerSettings
 from nsm.tasks.ensemble import Ensemble, members
 
 _MOST_VERTICES = 100_000  # of a mesh in the logs: TensorBoard's page loads all of them
@@ -87,6 +88,16 @@ class GradientWatch(Callback):
     ) -> None:
         self.every, self.stop_norm, self.summed = every, stop_norm, summed
         self.recent: deque[float] = deque(maxlen=window)
+
+    @classmethod
+    def of(cls, settings: TrainerSettings) -> GradientWatch:
+        """As the settings ``trainer`` want it."""
+        return cls(
+            settings.log_every,
+            settings.stop_gradient_norm,
+            settings.stop_window,
+            summed=settings.stop_norm_of == "sum",
+        )
 
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer

@@ -75,21 +75,30 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
 
 def neural_normals(phi: nn.Module, uv: np.ndarray) -> np.ndarray:
     """Unit normals (N, 3) of φ at points (N, 2) of Ω; zero where its Jacobian is degenerate."""
-    jacobian = evaluate_jacobian(phi, uv)[1]
-    cross = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
-    return cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-30)[:, None]
+    return _unit(_tangents_crossed(evaluate_jacobian(phi, uv)[1]))
 
 
 def normals_at_vertices(phi: nn.Module, surface: Surface) -> np.ndarray:
     """Unit normals (V, 3) of φ; those of its image's triangles where its Jacobian vanishes, as at
     the cones of a closed domain."""
     points, jacobian = evaluate_jacobian(phi, surface.uv)
-    area = np.linalg.norm(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]), axis=1)
+    normals = _tangents_crossed(jacobian)
+    area = np.linalg.norm(normals, axis=1)
     middle = evaluate_jacobian(phi, surface.uv[surface.faces].mean(axis=1))[1]
-    around = np.linalg.norm(np.cross(middle[:, :, 0], middle[:, :, 1]), axis=1)
+    around = np.linalg.norm(_tangents_crossed(middle), axis=1)
     vanishing = area < _VANISHING * vertex_means(around, surface.faces, len(area))
     of_triangles = vertex_normals(points, surface.faces, surface.seam_pairs)
-    return np.where(vanishing[:, None], of_triangles, neural_normals(phi, surface.uv))
+    return np.where(vanishing[:, None], of_triangles, _unit(normals))
+
+
+def _tangents_crossed(jacobian: np.ndarray) -> np.ndarray:
+    """φ_u × φ_v (N, 3) of Jacobians (N, 3, 2)."""
+    return np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    unit: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-30)[:, None]
+    return unit
 
 
 def by_normals(normals: np.ndarray) -> Callable[[Blend], np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.table import Column, Table
@@ -105,14 +105,16 @@ def warning_of_tears(name: str, metrics: Mapping[str, float]) -> Text | None:
         name: of the map.
         metrics: of :func:`nsm.results.pair_metrics`.
     """
-    largest = metrics.get("seam_gap_max_percent", 0.0)
-    if largest <= _TORN:
-        return None
-    return Text(
-        f"{name}: the surface is torn along its seam, by {largest:.3g} % of the diagonal at worst "
-        f"({metrics['seam_gap_mean_percent']:.3g} % in the mean). Give more landmarks, or, for "
-        "closed surfaces of genus 0 or 1, domain=orbifold or domain=torus, which have no seam",
-        style="bold red",
+    return _warning(
+        {name: metrics},
+        "seam_gap_max_percent",
+        _TORN,
+        lambda of: (
+            "the surface is torn along its seam, by "
+            f"{of['seam_gap_max_percent']:.3g} % of the diagonal at worst "
+            f"({of['seam_gap_mean_percent']:.3g} % in the mean). Give more landmarks, or, for "
+            "closed surfaces of genus 0 or 1, domain=orbifold or domain=torus, which have no seam"
+        ),
     )
 
 
@@ -123,16 +125,17 @@ def warning_of_distortion(maps: Mapping[str, Mapping[str, float]]) -> Text | Non
     Args:
         maps: the figures of :func:`nsm.results.pair_metrics` of each, by its name.
     """
-    key = "symmetric_dirichlet_median"
-    which, worst = _beyond(maps, key, _DISTORTED)
-    if not which:
-        return None
-    return Text(
-        f"{which}: strongly distorted, median symmetric Dirichlet {maps[worst][key]:.1f} "
-        f"({LEAST_SYMMETRIC_DIRICHLET} at best), 95th percentile "
-        f"{maps[worst]['symmetric_dirichlet_p95']:.0f}. A certificate says only that a map is "
-        "continuous and injective. Check the landmarks in landmarks.png, or give more of them",
-        style="bold red",
+    return _warning(
+        maps,
+        "symmetric_dirichlet_median",
+        _DISTORTED,
+        lambda of: (
+            "strongly distorted, median symmetric Dirichlet "
+            f"{of['symmetric_dirichlet_median']:.1f} ({LEAST_SYMMETRIC_DIRICHLET} at best), 95th "
+            f"percentile {of['symmetric_dirichlet_p95']:.0f}. A certificate says only that a map "
+            "is continuous and injective. Check the landmarks in landmarks.png, or give more of "
+            "them"
+        ),
     )
 
 
@@ -142,15 +145,15 @@ def warning_of_missed_landmarks(maps: Mapping[str, Mapping[str, float]]) -> Text
     Args:
         maps: as for :func:`warning_of_distortion`.
     """
-    key = "landmark_error_max_percent"
-    which, worst = _beyond(maps, key, _MISSED)
-    if not which:
-        return None
-    return Text(
-        f"{which}: a landmark is missed by {maps[worst][key]:.1f} % of the diagonal "
-        f"({maps[worst]['landmark_error_mean_percent']:.1f} % in the mean): landmarks contradict "
-        "each other, or the training was too short",
-        style="bold red",
+    return _warning(
+        maps,
+        "landmark_error_max_percent",
+        _MISSED,
+        lambda of: (
+            f"a landmark is missed by {of['landmark_error_max_percent']:.1f} % of the diagonal "
+            f"({of['landmark_error_mean_percent']:.1f} % in the mean): landmarks contradict each "
+            "other, or the training was too short"
+        ),
     )
 
 
@@ -161,15 +164,15 @@ def warning_of_folds(maps: Mapping[str, Mapping[str, float]]) -> Text | None:
     Args:
         maps: as for :func:`warning_of_distortion`.
     """
-    key = "flipped_before_repair_percent"
-    which, worst = _beyond(maps, key, _FOLDED)
-    if not which:
-        return None
-    return Text(
-        f"{which}: {maps[worst][key]:.1f} % of the triangles were folded before the repair, which "
-        "hardly happens in right maps: parts may go to wrong places. Check the landmarks in "
-        "landmarks.png, or give more of them",
-        style="bold red",
+    return _warning(
+        maps,
+        "flipped_before_repair_percent",
+        _FOLDED,
+        lambda of: (
+            f"{of['flipped_before_repair_percent']:.1f} % of the triangles were folded before the "
+            "repair, which hardly happens in right maps: parts may go to wrong places. Check the "
+            "landmarks in landmarks.png, or give more of them"
+        ),
     )
 
 
@@ -179,15 +182,16 @@ def warning_of_misfit(surfaces: Mapping[str, Mapping[str, float]]) -> Text | Non
     Args:
         surfaces: the figures of :func:`nsm.results.overfit_metrics` of each, by its name.
     """
-    key = "rms_percent"
-    which, worst = _beyond(surfaces, key, _MISFIT, "surfaces")
-    if not which:
-        return None
-    return Text(
-        f"{which}: φ is {surfaces[worst][key]:.3g} % of the diagonal off the mesh (RMS): what is "
-        "made from it belongs to another surface. Train it longer, or begin with the fit, "
-        "initialization=fitted",
-        style="bold red",
+    return _warning(
+        surfaces,
+        "rms_percent",
+        _MISFIT,
+        lambda of: (
+            f"φ is {of['rms_percent']:.3g} % of the diagonal off the mesh (RMS): what is made from "
+            "it belongs to another surface. Train it longer, or begin with the fit, "
+            "initialization=fitted"
+        ),
+        kind="surfaces",
     )
 
 
@@ -205,16 +209,29 @@ def warning_of_no_landmarks(name: str) -> Text:
     )
 
 
-def _beyond(
-    maps: Mapping[str, Mapping[str, float]], key: str, most: float, kind: str = "maps"
-) -> tuple[str, str]:
-    """Which maps, or others of a kind, have a figure above ``most``, in words, and the worst of
-    them; "" for none."""
+def _warning(
+    maps: Mapping[str, Mapping[str, float]],
+    key: str,
+    most: float,
+    words: Callable[[Mapping[str, float]], str],
+    kind: str = "maps",
+) -> Text | None:
+    """A line in red on the maps, or others of a kind, whose figure is above ``most``; None if there
+    is no such one.
+
+    Args:
+        maps: the figures of each, by its name.
+        key: of the figure.
+        most: that is well.
+        words: what is said of the figures of the worst one.
+        kind: of what there are several.
+    """
     far = [name for name, of in maps.items() if of.get(key, 0.0) > most]
     if not far:
-        return "", ""
+        return None
     worst = max(far, key=lambda name: maps[name][key])
-    return worst if len(maps) == 1 else f"{len(far)} of {len(maps)} {kind}, {worst} most", worst
+    which = worst if len(maps) == 1 else f"{len(far)} of {len(maps)} {kind}, {worst} most"
+    return Text(f"{which}: {words(maps[worst])}", style="bold red")
 
 
 _COLLECTION_COLUMNS = {

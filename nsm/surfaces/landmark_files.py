@@ -12,7 +12,7 @@ from xml.parsers import expat
 import numpy as np
 
 from nsm.surfaces.landmarks import Landmarks, listed
-from nsm.surfaces.loading import check_file, error_in
+from nsm.surfaces.loading import check_file, error_in, is_number
 from nsm.wording import number_of
 
 _LARGEST = 10_000_000  # bytes
@@ -145,7 +145,7 @@ def _vertex_lines(file: Path) -> Marks:
             reason = f"line {number} does not start with a vertex number"
             raise error_in(file, "damaged_file", reason) from None
         rest = fields[1:]
-        names.append("" if all(map(_is_number, rest)) else " ".join(rest))
+        names.append("" if all(map(is_number, rest)) else " ".join(rest))
     return Marks(numbers, _names(names))
 
 
@@ -227,14 +227,6 @@ def _lines(file: Path) -> list[tuple[int, list[str]]]:
 def _names(names: list[str]) -> tuple[str, ...] | None:
     """Names, if each landmark has its own."""
     return tuple(names) if all(names) and len(set(names)) == len(names) else None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _json(file: Path) -> Any:

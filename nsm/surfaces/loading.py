@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -40,6 +41,35 @@ def is_mesh_path(text: str) -> bool:
     if os.path.isfile(text):
         return True
     return "=" not in text and PurePath(text).suffix.lower() in EXTENSIONS
+
+
+def is_number(word: str) -> bool:
+    """Whether a word of a text file is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+@contextmanager
+def parsing(file: Path, fault: str) -> Iterator[None]:
+    """Turn what parsers raise on damaged files into an error on the file.
+
+    Args:
+        file: that is read.
+        fault: begins the message, before what the parser says.
+
+    Raises:
+        NsmError: ``unreadable_file``.
+    """
+    try:
+        yield
+    except NsmError:
+        raise
+    except Exception as error:  # parsers raise any exception on damaged files
+        cause = " ".join(str(error).split())[:150] or type(error).__name__
+        raise error_in(file, "unreadable_file", f"{fault} ({cause}); export it again") from error
 
 
 def check_file(file: Path, largest: int, endings: Sequence[str] = ()) -> None:
@@ -91,14 +121,8 @@ def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
 
 def _read(file: Path, suffix: str) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     reader = {".obj": _read_obj, ".off": _read_off, ".ply": _read_ply}.get(suffix, _read_trimesh)
-    try:
+    with parsing(file, f"not a readable {suffix[1:].upper()} mesh"):
         vertices, faces, log = reader(file)
-    except NsmError:
-        raise
-    except Exception as error:  # parsers raise any exception on damaged files
-        cause = " ".join(str(error).split())[:150] or type(error).__name__
-        reason = f"not a readable {suffix[1:].upper()} mesh ({cause}); export it again"
-        raise error_in(file, "unreadable_file", reason) from error
     check_arrays(vertices, faces, str(file))
     return vertices, faces, tuple(log)
 

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from nsm.surfaces.gltf import FolderResolver, check_images, check_textures
-from nsm.surfaces.loading import check_file, error_in
+from nsm.surfaces.loading import check_file, error_in, is_number
 
 # The base colour of a material, (H, W, C) uint8, which is read when it is called: an image that is
 # missing is no error for a mesh of which only the coordinates are wanted.
@@ -135,7 +135,7 @@ def _mapped(mesh: Path, words: str) -> np.ndarray:
         for _ in range(_OPTIONS.get(option, 1)):
             first, *rest = words.split(None, 1) or [""]
             if option in _NEUTRAL:
-                if not _is_number(first):
+                if not is_number(first):
                     break
                 if float(first) != _NEUTRAL[option]:
                     raise error_in(
@@ -145,14 +145,6 @@ def _mapped(mesh: Path, words: str) -> np.ndarray:
                     )
             words = rest[0] if rest else ""
     return _beside(mesh, words)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def of_ply(comments: Sequence[str], mesh: Path) -> Paint:

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from nsm.errors import NsmError
 from nsm.surfaces import materials
 from nsm.surfaces.loading import (
     LARGEST_FILE,
     check_file,
     error_in,
     fans,
+    parsing,
     ply_polygons,
     read_ply,
     read_scene,
@@ -142,15 +142,9 @@ def _read(file: Path) -> _Read:
         reason = f"{kind} no texture coordinates; use an OBJ or GLB file"
         raise error_in(file, "missing_uv", reason)
     check_file(file, LARGEST_FILE)
-    try:
+    with parsing(file, "its texture cannot be read"):
         uv, number, paints = _READERS[suffix](file)
         return np.where(np.abs(uv) < _LARGEST_UV, uv, np.nan), number, paints
-    except NsmError:
-        raise
-    except Exception as error:  # parsers raise any exception on damaged files
-        cause = " ".join(str(error).split())[:150] or type(error).__name__
-        reason = f"its texture cannot be read ({cause}); export it again"
-        raise error_in(file, "unreadable_file", reason) from error
 
 
 def _read_obj(file: Path) -> _Read:

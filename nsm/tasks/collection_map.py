@@ -59,6 +59,7 @@ class CollectionMap(ConstrainedMap):
 
     Constraints = CollectionConstraints
     constraints: CollectionConstraints
+    quadrature: CollectionQuadrature | None
 
     def __init__(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import comb
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from scipy.sparse import csr_matrix, diags, kron
 from scipy.sparse.linalg import splu
 
 from nsm.maps import LatticeSplineGrid
+from nsm.maps.two_scale import two_scale_weights
 
 # so few cells a side, or an odd number, are solved directly
 _DIRECT = 64
@@ -110,7 +110,7 @@ def lattice_refinements(grid: LatticeSplineGrid, level: int) -> list[csr_matrix]
     ups = []
     while n * m > _DIRECT**2 and n % 2 == 0 and m % 4 == 0:
         n, m = n // 2, m // 2
-        both = kron(periodic_refinement_along(n), periodic_refinement_along(m)).tocsr()
+        both = kron(*(refinement_along(side, periodic=True) for side in (n, m))).tocsr()
         fine, coarse = folding(grid, 2 * n, 2 * m), folding(grid, n, m)
         # the fine coefficients of an orbit are equal: their mean is each of them
         orbit = np.asarray(fine.sum(axis=0)).ravel()
@@ -126,31 +126,26 @@ def folding(grid: LatticeSplineGrid, n: int, m: int) -> csr_matrix:
     return csr_matrix((ones, (np.arange(n * m), rows)), shape=(n * m, int(rows.max()) + 1))
 
 
-def periodic_refinement_along(cells: int) -> csr_matrix:
-    """The two-scale relation of quadratic splines along an axis, (2·cells, cells)."""
-    coarse = np.arange(cells)
-    fine = np.concatenate([(2 * coarse - 1 + k) % (2 * cells) for k in range(4)])
-    weights = np.repeat([0.25, 0.75, 0.75, 0.25], cells)
-    return csr_matrix((weights, (fine, np.tile(coarse, 4))), shape=(2 * cells, cells))
-
-
 def refinement(cells: int, degree: int) -> csr_matrix:
     """From the table of a grid to that of twice as many cells a side, for the same spline."""
     along = refinement_along(cells, degree)
     return kron(along, along).tocsr()
 
 
-def refinement_along(cells: int, degree: int = 2) -> csr_matrix:
-    """The two-scale relation along an axis, (2·cells + degree, cells + degree)."""
-    coarse = np.arange(cells + degree)
+def refinement_along(cells: int, degree: int = 2, periodic: bool = False) -> csr_matrix:
+    """The two-scale relation along an axis, (2·cells + degree, cells + degree), or (2·cells, cells)
+    if it is periodic."""
+    more = 0 if periodic else degree
+    coarse = np.arange(cells + more)
     rows, columns, weights = [], [], []
-    for k in range(degree + 2):
-        fine = 2 * coarse - degree + k
-        there = (fine >= 0) & (fine < 2 * cells + degree)
+    for k, weight in enumerate(two_scale_weights(degree)):
+        # a periodic table begins with the spline in the middle of the first cell
+        fine = (2 * coarse - degree // 2 + k) % (2 * cells) if periodic else 2 * coarse - degree + k
+        there = (fine >= 0) & (fine < 2 * cells + more)
         rows.append(fine[there])
         columns.append(coarse[there])
-        weights.append(np.full(there.sum(), comb(degree + 1, k) / 2**degree))
+        weights.append(np.full(there.sum(), weight))
     return csr_matrix(
         (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
-        shape=(2 * cells + degree, cells + degree),
+        shape=(2 * cells + more, cells + more),
     )

@@ -9,12 +9,7 @@ import torch
 from torch import Tensor
 
 from nsm.maps import SplineField
-
-_LEAST = 4  # cells
-_NEAR, _FAR = 0.75, 0.25  # of quadratic B-splines, as in nsm.tasks.multigrid
-# A coefficient is its coordinate times this over √cells: a step of a fine level then does not
-# change slopes much more than that of a coarse one.
-_SCALE = 0.5
+from nsm.maps.two_scale import FAR, NEAR, level_cells, level_scale, refined
 
 
 class MultilevelAdam:
@@ -35,10 +30,7 @@ class MultilevelAdam:
         self, field: SplineField, betas: tuple[float, float], eps: float, largest: float
     ) -> None:
         self.betas, self.eps, self.largest = betas, eps, largest
-        cells = [field.cells]
-        while cells[0] % 2 == 0 and cells[0] // 2 >= _LEAST and not (field.odd and cells[0] % 4):
-            cells.insert(0, cells[0] // 2)
-        self.scales = [_SCALE / n**0.5 for n in cells]
+        self.scales = [level_scale(n) for n in level_cells(field.cells, even=field.odd)]
         self.two_scale = TwoScale(field)
 
     def change(
@@ -105,12 +97,8 @@ class TwoScale:
     def refined(self, table: Tensor) -> Tensor:
         """The table of the same spline on a grid of twice as many cells a side."""
         for axis in (1, 2):
-            wide = self._widened(table, axis) if self.periodic else table
-            count = wide.shape[axis] - 1
-            a, b = wide.narrow(axis, 0, count), wide.narrow(axis, 1, count)
-            fine = torch.stack([_NEAR * a + _FAR * b, _FAR * a + _NEAR * b], dim=axis + 1)
-            table = fine.flatten(axis, axis + 1)
-            if self.periodic:  # without those beside the rows and columns from beyond
+            table = refined(table, axis, self._widened(table, axis))
+            if not self.periodic:  # the square does not see the first and the last
                 table = table.narrow(axis, 1, table.shape[axis] - 2)
         return table
 
@@ -118,20 +106,22 @@ class TwoScale:
         """The transpose of :meth:`refined`: from a gradient by the finer table to that by the
         coarser."""
         for axis in (1, 2):
-            if self.periodic:
-                wide = self._widened(table, axis)
-            else:
-                none = torch.zeros_like(table.narrow(axis, 0, 2))
-                wide = torch.cat([none, table, none], dim=axis)
+            wide = self._widened(table, axis)
+            if not self.periodic:  # the first and the last that refined left out
+                wide = self._widened(wide, axis)
             a, b = wide.unflatten(axis, (-1, 2)).unbind(dim=axis + 1)
             count = a.shape[axis] - 1
-            before = _FAR * a.narrow(axis, 0, count) + _NEAR * b.narrow(axis, 0, count)
-            table = before + _NEAR * a.narrow(axis, 1, count) + _FAR * b.narrow(axis, 1, count)
+            before = FAR * a.narrow(axis, 0, count) + NEAR * b.narrow(axis, 0, count)
+            table = before + NEAR * a.narrow(axis, 1, count) + FAR * b.narrow(axis, 1, count)
         return table
 
     def _widened(self, table: Tensor, axis: int) -> Tensor:
-        """A periodic table with the rows (axis 1) or columns next beyond its first and last."""
+        """A table with the rows (axis 1) or columns next beyond its first and last; zeros, if it is
+        not periodic."""
         first, last = table.narrow(axis, 0, 1), table.narrow(axis, table.shape[axis] - 1, 1)
+        if not self.periodic:
+            none = torch.zeros_like(first)
+            return torch.cat([none, table, none], dim=axis)
         if self.odd and axis == 1:
             return torch.cat([-first.flip(2), table, -last.flip(2)], dim=1)
         return torch.cat([last, table, first], dim=axis)

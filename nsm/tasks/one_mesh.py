@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nsm.data import Samples
 from nsm.energies import At
@@ -14,8 +14,11 @@ from nsm.energies.metrics import determinant
 from nsm.tasks.at_triangles import AtTriangles
 from nsm.tasks.curvature import positive_hessians
 from nsm.tasks.fold_barrier import FoldBarrier, Folds
-from nsm.tasks.mesh_quadrature import Triangles
+from nsm.tasks.mesh_quadrature import MeshQuadrature, Triangles
 from nsm.tasks.terms import Distortion, Evaluation
+
+# of a large mesh's triangles, whatever the batch is: fewer would be overfitted
+_FEWEST = 24_576
 
 
 class Places(NamedTuple):
@@ -45,10 +48,31 @@ class OneMeshMap(AtTriangles):
         fold_barrier: of the mesh's triangles.
     """
 
+    quadrature: MeshQuadrature | None
     fold_barrier: FoldBarrier
 
     energy: Any
     folds: Folds
+
+    def set_quadrature(
+        self, share: float, max_steps: int, uv: Tensor, faces: Tensor, surface: nn.Module
+    ) -> None:
+        """Measure at triangles after a share of the steps; with all of them, at samples alone.
+
+        Args:
+            share: of the steps.
+            max_steps: their number.
+            uv, faces, surface: see :class:`nsm.tasks.mesh_quadrature.MeshQuadrature`.
+        """
+        self.triangles_from = share * max_steps
+        if share < 1:
+            self.quadrature = MeshQuadrature(uv, faces, surface)
+
+    def triangles(self, batch_size: int) -> Triangles | None:
+        """Those at which the distortion of a training step is measured; None: it is at samples."""
+        if self.quadrature is None or self.global_step < self.triangles_from:
+            return None
+        return self.quadrature.take(max(batch_size, _FEWEST))
 
     def _places(self, batch: Samples) -> Places:
         """Where a step measures: at samples, or at triangles, for which their centres stand."""

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from nsm.maps import SplineField
-from nsm.tasks.multigrid import periodic_refinement_along, refinement_along
+from nsm.tasks.multigrid import refinement_along
 
 # of H¹ beside the curvature of the loss: it decides where no point sees a coefficient
 _FLOOR = 1e-3
@@ -37,9 +37,9 @@ class Level:
 
     def __init__(self, field: SplineField, cells: int) -> None:
         finer, along = cells, identity(cells if field.periodic else cells + 2, format="csr")
-        refined = periodic_refinement_along if field.periodic else refinement_along
         while cells >= 3 and finer < field.cells:
-            along, finer = refined(finer) @ along, 2 * finer
+            up = refinement_along(finer, periodic=field.periodic)
+            along, finer = up @ along, 2 * finer
         if finer != field.cells:
             raise ValueError(
                 f"map.cells {field.cells} is not optimizer.levels' {cells}, 3 or more, times a "

@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from nsm.domains.joint_preparation import (
-    Mesh,
-    cut_together,
-    matched_landmarks,
-    prepare_jointly,
-    with_ends,
-)
+from nsm.domains.joint_preparation import Mesh, prepare_jointly
+from nsm.domains.matched_landmarks import cut_together, matched_landmarks, with_ends
 from nsm.errors import NsmError
 from nsm.surfaces import topology
 from nsm.surfaces.shapes import cylinder

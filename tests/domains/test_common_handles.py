@@ -8,7 +8,8 @@ from nsm.domains import Disc
 from nsm.domains.common_cut import best_common_cut
 from nsm.domains.common_handles import open_handles
 from nsm.domains.common_seams import aligned_keys, lead_tree, tracers_of
-from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_jointly
+from nsm.domains.joint_preparation import Mesh, prepare_jointly
+from nsm.domains.matched_landmarks import matched_landmarks
 from nsm.surfaces import topology
 from nsm.surfaces.cutting import cut_along_paths
 from nsm.surfaces.validation import clean

@@ -15,7 +15,8 @@ from nsm.domains.common_seams import (
     mutually_far,
     seam_costs,
 )
-from nsm.domains.joint_preparation import Mesh, matched_landmarks, prepare_jointly
+from nsm.domains.joint_preparation import Mesh, prepare_jointly
+from nsm.domains.matched_landmarks import matched_landmarks
 from nsm.domains.orbifold.common_cones import choose_common_cones, distinct
 from nsm.errors import NsmError
 from nsm.surfaces import topology

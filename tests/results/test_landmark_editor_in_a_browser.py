@@ -1,11 +1,11 @@
 """The editor of landmarks in a headless browser: real clicks, drags and buttons."""
 
-import shutil
 import time
 
 import numpy as np
 import pytest
 import trimesh
+from chromium import headless
 
 from nsm.correspondence.landmark_list import LandmarkList
 from nsm.surfaces.landmark_files import read_pairs
@@ -27,33 +27,9 @@ def edited(tmp_path):
 
 
 @pytest.fixture
-def window(tmp_path):
-    """Headless Chromium."""
-    webdriver = pytest.importorskip("selenium.webdriver")
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not (chromium and driver):
-        pytest.skip("chromium and chromedriver are not installed")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    size = "{width},{height}".format(**SIZE)
-    for word in (
-        "headless",
-        "no-sandbox",
-        "no-first-run",
-        "disable-background-networking",
-        "disable-component-update",
-        "disable-sync",
-        "use-angle=swiftshader",
-        "enable-unsafe-swiftshader",
-        f"window-size={size}",
-        f"user-data-dir={tmp_path / 'profile'}",
-    ):
-        options.add_argument(f"--{word}")
-    opened = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    try:
+def window():
+    with headless(**SIZE) as opened:
         yield opened
-    finally:
-        opened.quit()
 
 
 def until(condition):

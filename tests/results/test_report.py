@@ -7,13 +7,13 @@ import io
 import json
 import re
 import shutil
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from chromium import headless
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -408,40 +408,13 @@ def test_the_command_writes_the_page_and_prints_its_path(runs, tmp_path, here):
 @pytest.fixture(scope="module")
 def browser(page):
     """Headless Chromium with the page in it."""
-    webdriver = pytest.importorskip("selenium.webdriver")
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not (chromium and driver):
-        pytest.skip("chromium and chromedriver are not installed")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for word in (
-        "headless",
-        "no-sandbox",
-        "disable-gpu",
-        "disable-quic",
-        "no-first-run",
-        "disable-background-networking",
-        "disable-component-update",
-        "disable-sync",
-        "use-angle=swiftshader",
-        "enable-unsafe-swiftshader",
-        "window-size=1400,1000",
-    ):
-        options.add_argument(f"--{word}")
-    profile = tempfile.mkdtemp()
-    options.add_argument(f"--user-data-dir={profile}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    service = webdriver.ChromeService(driver)
-    window = webdriver.Chrome(options=options, service=service)
-    window.set_script_timeout(TIMEOUT)
-    try:
+    logs = {"browser": "ALL", "performance": "ALL"}
+    with headless(1400, 1000, ["disable-gpu", "disable-quic"], logs) as window:
+        window.set_script_timeout(TIMEOUT)
         window.get(page.as_uri())
         until(window, "return document.documentElement.dataset.state === 'ready'")
         click(window, "#tasks button[data-name=overfit]")
         yield window
-    finally:
-        window.quit()
-        shutil.rmtree(profile, ignore_errors=True)
 
 
 def until(window, question: str) -> None:

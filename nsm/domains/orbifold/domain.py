@@ -41,7 +41,6 @@ class ClosedDomain(Domain):
     even: ClassVar[bool]
     low: ClassVar[tuple[float, float]]  # corner of the fundamental domain; the other is (1, 1)
 
-    @abstractmethod
     def embed(
         self,
         vertices: np.ndarray,
@@ -62,6 +61,14 @@ class ClosedDomain(Domain):
             NsmError: ``wrong_topology``: the surface has a boundary or another genus;
                 ``unknown_option``, ``wrong_cones`` or ``not_injective``.
         """
+        self._check(faces, method, name)
+        return self._embedded(vertices, faces, name, keys)
+
+    @abstractmethod
+    def _embedded(
+        self, vertices: np.ndarray, faces: np.ndarray, name: str, cones: Any
+    ) -> Embedding:
+        """As :meth:`embed`, of a mesh of the domain's topology."""
 
     def _check(self, faces: np.ndarray, method: str, name: str) -> None:
         if method != "slim":
@@ -254,19 +261,10 @@ class Orbifold(ClosedDomain):
     even = True
     low = (-1.0, 0.0)
 
-    def embed(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        *,
-        method: str = "slim",
-        name: str = "mesh",
-        keys: Any = None,
+    def _embedded(
+        self, vertices: np.ndarray, faces: np.ndarray, name: str, cones: Any
     ) -> Embedding:
-        """See :meth:`ClosedDomain.embed` and
-        :func:`nsm.domains.orbifold.embedding.embed_orbifold`."""
-        self._check(faces, method, name)
-        return embed_orbifold(vertices, faces, keys)
+        return embed_orbifold(vertices, faces, cones)
 
     def equivariant(self, network: nn.Module) -> nn.Module:
         """h(x) = x + ½(n(x) - n(-x)) around a periodic network n; x + n(x) if n is odd."""
@@ -286,19 +284,10 @@ class Torus(ClosedDomain):
     even = False
     low = (-1.0, -1.0)
 
-    def embed(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        *,
-        method: str = "slim",
-        name: str = "mesh",
-        keys: Any = None,
+    def _embedded(
+        self, vertices: np.ndarray, faces: np.ndarray, name: str, cones: Any
     ) -> Embedding:
-        """See :meth:`ClosedDomain.embed` and
-        :func:`nsm.domains.orbifold.embedding.embed_torus`."""
-        self._check(faces, method, name)
-        if keys is not None:
+        if cones is not None:
             raise NsmError(
                 f"{name}: a torus has no cones; leave cones out", kind="wrong_domain", key="cones"
             )
