@@ -187,20 +187,20 @@ class ConstrainedMap(AtTriangles):
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
         self._hold_landmarks()
-        optimizer = self.trainer.optimizers[0]
-        at_triangles = self.global_step > self.triangles_from
-        if at_triangles and isinstance(optimizer, QuasiNewton) and optimizer.on_last_level:
-            self._stop_if_settled()
+        if self.global_step > self.triangles_from:
+            optimizer = self.trainer.optimizers[0]
+            if isinstance(optimizer, QuasiNewton) and optimizer.on_last_level:
+                self._stop_if_settled()
 
     def _stop_if_settled(self) -> None:
         assert self.distortion is not None
+        change = (self.reached / self.distortion - 1).abs()
         with torch.no_grad():
-            change = (self.reached - self.distortion).abs() / self.distortion.abs()
-            met = bool((self.landmark_error()[self.held] < _MET).all()) if len(self.points) else True
+            missed = len(self.points) > 0 and bool((self.landmark_error()[self.held] > _MET).any())
             flipped = self.flipped_percent()
-        fewer = bool(flipped < self.flipped)
-        self.reached, self.flipped = self.distortion.detach().to(self.reached), flipped
-        if change < _SETTLED and met and not fewer:
+        opening = bool(flipped < self.flipped)
+        self.reached, self.flipped = self.distortion.to(self.reached), flipped
+        if change < _SETTLED and not missed and not opening:
             self.settled.fill_(True)
             self.trainer.should_stop = True
 
@@ -228,7 +228,12 @@ class ConstrainedMap(AtTriangles):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
-        for name in ("lost", "reached", "flipped", "settled"):  # an earlier version's are as they are at first
+        for name in (
+            "lost",
+            "reached",
+            "flipped",
+            "settled",
+        ):  # an earlier version's are as they are at first
             checkpoint["state_dict"].setdefault(name, getattr(self, name))
 
     def strengthen(self, steps: int) -> None:

@@ -37,14 +37,15 @@ class Constant(LambdaLR):
 
 
 class Cosine(LambdaLR):
-    """One half-wave from the full rate to ``final`` of it at the last step.
+    """One half-wave from the full rate to ``final`` of it at its end.
 
     Args:
         optimizer: whose rates are scheduled.
         max_steps: length of the training.
         warmup: steps of linear rise at the start.
-        final: share of the full rate at the last step.
+        final: share of the full rate at the end of the wave.
         peak: share of the optimizer's rates that is the full rate.
+        until: share of the steps at which the wave ends.
 
     Raises:
         NsmError: a negative number.
@@ -57,11 +58,12 @@ class Cosine(LambdaLR):
         warmup: Whole = 0,
         final: Share = 0.0,
         peak: Weight = 1.0,
+        until: Share = 1.0,
     ) -> None:
-        _check(final=final)
+        _check(final=final, until=until)
 
         def course(step: float) -> float:
-            return _wave(min(1.0, step / max(1, max_steps)), final)
+            return _wave(min(1.0, step / max(1, until * max_steps)), final)
 
         super().__init__(optimizer, _share(course, warmup, peak))
 

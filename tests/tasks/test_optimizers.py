@@ -71,6 +71,12 @@ def test_the_last_wave_of_sgdr_ends_with_the_training(max_steps, factor):
     assert 10 / 3 < scheduler.first < 30 or max_steps < 10
 
 
+def test_a_cosine_may_end_before_the_training():
+    part, whole = (rates(schedule("Cosine", final=0.1, **p), 50, 51) for p in ({"until": 0.5}, {}))
+    assert part[:26] == pytest.approx(whole[:51:2])
+    assert part[25:] == pytest.approx([0.1] * 26)
+
+
 def test_cosine_falls_to_its_final_share():
     lr = rates(schedule("Cosine", final=0.1), 50, 51)
     assert lr[0] == 1.0
