@@ -128,9 +128,9 @@ def given_or_proposed(
 ) -> tuple[list[Shape], list[np.ndarray], ProposedLandmarks | None]:
     """The landmarks of a map: those given, those proposed, or both.
 
-    Landmarks are proposed if they are ``auto``; and on the orbifold for meshes if none are given,
-    or one to eight, which are completed. Four are enough for common cones: unsure ones do not come
-    to them.
+    Landmarks are proposed if they are ``auto``; and for closed meshes, on the domain that suits
+    them, if none are given, or one to eight, which are completed; of meshes with handles for two,
+    and up to four. Four are enough for common cones: unsure ones do not come to them.
 
     Args:
         landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them, or
