@@ -498,8 +498,8 @@ class Settings:
             b2] with barycentric coordinates, stands for the vertex nearest to it, and -1 or null
             for a landmark that the surface lacks; a CSV file with a column for each surface; a
             folder with a file for each surface, of its name; auto, for
-            closed meshes of genus 0: landmarks are proposed, as they are where none are given;
-            []: none.
+            closed meshes, in a collection those of genus 0: landmarks are proposed, as they are
+            where none are given; []: none.
         isotopy_class: of task=pair_map on a closed domain, the class of maps in which the training
             begins: 0 is the likeliest. Where the map turns out wrong, the next ones are tried.
         seams: of task=param: edges along which the mesh is cut, as a list of pairs of vertices or a

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.correspondence.distances import edge_distances
+from nsm.correspondence.opened_handles import Opened
 from nsm.correspondence.tips import tips_of
 from nsm.domains.orbifold.cones import decimated
 from nsm.errors import NsmError
@@ -35,7 +36,8 @@ class CoarseShape:
         mean_distance: (V,) to all points of the surface.
         tips: (K,) vertices far from everything, the most prominent first; given ones before them.
         samples: (M,) vertices that are spread evenly.
-        given: how many of the tips are landmarks that were given.
+        mesh: that it was made from.
+        given: how many of the tips are landmarks that were given, or caps.
     """
 
     vertices: np.ndarray
@@ -45,6 +47,7 @@ class CoarseShape:
     mean_distance: np.ndarray
     tips: np.ndarray
     samples: np.ndarray
+    mesh: Opened
     given: int = 0
 
     @property
@@ -74,14 +77,16 @@ def coarse_shape(
     tips: np.ndarray | None = None,
     fixed: np.ndarray | None = None,
     count: int = _FACES,
+    opened: Opened | None = None,
 ) -> CoarseShape:
     """The coarse shape of a closed mesh (V, 3), (F, 3) of genus 0.
 
     Args:
         vertices, faces: the mesh.
         tips: (K,) vertices that stand for the tips, which are found if not given.
-        fixed: (G,) vertices, landmarks that are given; tips near them are left out.
+        fixed: (G,) vertices, landmarks that are given, and caps; tips near them are left out.
         count: of its faces, about.
+        opened: the mesh, if it is one with handles that were cut open.
 
     Raises:
         NsmError: ``wrong_topology`` for any other mesh; ``no_proposal`` for one with fewer than
@@ -94,7 +99,8 @@ def coarse_shape(
         or topology.euler_characteristic(faces) != 2
     ):
         raise NsmError(
-            "correspondences without landmarks need closed surfaces of genus 0; give landmarks",
+            "correspondences without landmarks need closed surfaces, in collections those of "
+            "genus 0; give landmarks",
             kind="wrong_topology",
             key="landmarks",
         )
@@ -105,7 +111,7 @@ def coarse_shape(
             unit = np.sqrt(topology.face_areas(vertices, faces).sum())
             apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
             others = tips[apart > _NEAR]
-            if given < COMMON:
+            if given - (0 if opened is None else len(opened.caps)) < COMMON:
                 others = others[: _MOST - given]
             tips = np.concatenate([fixed, others])
     if len(tips) < 4:
@@ -129,6 +135,7 @@ def coarse_shape(
         distance @ corner,
         tips,
         _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
+        Opened.uncut(vertices, faces) if opened is None else opened,
         given,
     )
 

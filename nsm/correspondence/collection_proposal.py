@@ -67,7 +67,7 @@ def proposed_for_all(
     shapes = [coarse_shape(*mesh, fixed=fixed[:, i]) for i, mesh in enumerate(meshes)]
     hub = hub_of(shapes)
     others = [i for i in range(k) if i != hub]
-    found = {i: hypotheses(shapes[hub], shapes[i]) for i in others}
+    found = {i: hypotheses(shapes[hub], [shapes[i]]) for i in others}
     own = {i: np.array([h.score for h in found[i]]) for i in others}
     between = {
         (i, j): np.array([[_between(g, h) for h in found[j]] for g in found[i]]) / (k - 2)
@@ -78,7 +78,7 @@ def proposed_for_all(
     if margin <= LEAST_MARGIN and len(fixed) < COMMON:
         for i, numbers in counted("finer maps", list(_near(found_ways).items())):
             tied = [found[i][n] for n in numbers]
-            own[i][numbers] = told_apart(tied, (meshes[hub], meshes[i]))
+            own[i][numbers] = told_apart(tied)
         found_ways = ways(own, between)
         margin = min(margin, _margin(found_ways))
     best = found_ways[0]

@@ -13,40 +13,39 @@ import numpy as np
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.layouts import Layout, Table, affine_maps, layout, table
 from nsm.correspondence.scores import score
-from nsm.correspondence.search import Candidate, Round, fixed_pairs, trained
+from nsm.correspondence.search import Candidate, Round, trained
 
 FACES = 2500
 ROUNDS = (Round(0, 8, 30), Round(0, 12, 40))  # with tips drawn together, and then let go
 
-Mesh = tuple[np.ndarray, np.ndarray]
 
-
-def finer_scores(
-    meshes: tuple[Mesh, Mesh], found: Sequence[Candidate], drawn: Sequence[np.ndarray]
-) -> np.ndarray:
+def finer_scores(found: Sequence[Candidate], drawn: Sequence[np.ndarray]) -> np.ndarray:
     """The scores (H,) of coarse maps, made anew on finer shapes; lower is better.
 
     Of each map the cones stay where they are, and all isotopy classes that are likely with these
     are tried.
 
     Args:
-        meshes: vertices (V, 3) and faces (F, 3) of source and target.
-        found: coarse maps of two shapes.
-        drawn: of each the corresponding vertices (L, 2) of the meshes, tips of both shapes, that
+        found: coarse maps of one source.
+        drawn: of each the corresponding vertices (L, 2) of its shapes' meshes, tips of both, that
             are drawn together.
 
     Returns:
         inf where the layout of a finer shape lacks digits.
     """
-    source = _finer(meshes[0], found[0].source.shape)
-    target = _finer(meshes[1], found[0].target.shape)
+    source = _finer(found[0].source.shape)
+    targets: dict[int, CoarseShape] = {}
     ours: dict[bytes, Layout | None] = {}
-    theirs: dict[bytes, tuple[Layout, Table] | None] = {}
+    theirs: dict[tuple[int, bytes], tuple[Layout, Table] | None] = {}
     starts: list[Candidate] = []
     number: list[int] = []
     pairs: list[np.ndarray] = []
     for k, (one, ids) in enumerate(zip(found, drawn, strict=True)):
-        first, second = one.source.tips.tobytes(), one.target.tips.tobytes()
+        of_target = id(one.target.shape)
+        if of_target not in targets:
+            targets[of_target] = _finer(one.target.shape)
+        target = targets[of_target]
+        first, second = one.source.tips.tobytes(), (of_target, one.target.tips.tobytes())
         if first not in ours:
             ours[first] = layout(source, one.source.tips)
         if second not in theirs:
@@ -64,14 +63,15 @@ def finer_scores(
     scores = np.full(len(found), np.inf)
     if starts:
         done = trained(starts, ROUNDS[0], drawn=pairs)
-        done = trained(done, ROUNDS[1], fixed_pairs(done[0]))
+        done = trained(done, ROUNDS[1], held=True)
         np.minimum.at(scores, number, [score(one) for one in done])
     return scores
 
 
-def _finer(mesh: Mesh, shape: CoarseShape) -> CoarseShape:
+def _finer(shape: CoarseShape) -> CoarseShape:
     tips = shape.ids[shape.tips]
-    return coarse_shape(*mesh, tips=tips, fixed=tips[: shape.given], count=FACES)
+    fixed = tips[: shape.given]
+    return coarse_shape(*shape.mesh.arrays, tips, fixed, FACES, shape.mesh)
 
 
 def _starts(one: Candidate, a: Layout, b: Layout, looked_up: Table) -> list[Candidate]:

@@ -12,7 +12,6 @@ import numpy as np
 
 from nsm.correspondence.coarse_shape import CoarseShape, coarse_shape
 from nsm.correspondence.distances import edge_distances
-from nsm.correspondence.finer_maps import Mesh
 from nsm.correspondence.scores import score
 from nsm.correspondence.search import Round, fixed_pairs, through_four, trained
 from nsm.correspondence.tips import limb_ends
@@ -29,6 +28,7 @@ _COST = 0.05  # by which the score may rise for each pair of ends
 _AHEAD = 0.03  # by which it must be lower than that of as many other pairs
 _PAIRS, _TRIED = 10, 48  # of which matchings are made, and how many are tried
 
+Mesh = tuple[np.ndarray, np.ndarray]
 Pair = tuple[int, int]
 
 

@@ -26,9 +26,8 @@ def mended(found: Sequence[Candidate], one: Round) -> list[Candidate]:
         one: how many of them are mended, and how.
     """
     kept = sorted(found, key=score)[: one.maps]
-    held = fixed_pairs(kept[0])
-    drawn = [np.concatenate([held, left_apart(candidate)]) for candidate in kept]
-    freed = trained(trained(kept, one, drawn=drawn), one, held)
+    drawn = [np.concatenate([fixed_pairs(c), left_apart(c)]) for c in kept]
+    freed = trained(trained(kept, one, drawn=drawn), one, held=True)
     return sorted((min(pair, key=score) for pair in zip(kept, freed, strict=True)), key=score)
 
 

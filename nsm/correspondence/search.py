@@ -94,9 +94,11 @@ class Candidate:
 
 
 def candidates(
-    source: CoarseShape, target: CoarseShape, rounds: Sequence[Round] = ROUNDS
+    source: CoarseShape, targets: Sequence[CoarseShape], rounds: Sequence[Round] = ROUNDS
 ) -> list[Candidate]:
-    """Maps of the source to the target that may be right, least distorted first.
+    """Maps of the source to a target that may be right, least distorted first.
+
+    Several targets are one surface whose handles were cut open elsewhere.
 
     Landmarks that are given on both shapes are held: a map does not take one to another tip, and
     what it misses them by is added to its energy. Of five or more, four are the cones.
@@ -105,13 +107,17 @@ def candidates(
         NsmError: ``no_proposal``: no map meets the landmarks that are given; ``not_injective``:
             of five or more, all fours are too close to each other.
     """
-    if source.given >= COMMON:
-        found = through_four(source, target, np.arange(source.given))
+    if source.given - len(source.mesh.caps) >= COMMON:
+        found = through_four(source, targets[0], np.arange(source.given))
         drawn = [fixed_pairs(found[0])] * len(found)
         return sorted(trained(found, _THROUGH, drawn=drawn), key=lambda c: c.cost)
     sets, scores = quick_scores(source)
-    ours = _laid_out(source, sets[np.argsort(scores)[:_SOURCE_SETS]], "layouts of the source")
-    theirs = _laid_out(target, _similar_sets(ours, target), "layouts of the target")
+    ours = _laid_out(source, _least_distorted(source, sets, scores), "layouts of the source")
+    theirs = [
+        one
+        for target, chosen in _similar_sets(ours, targets)
+        for one in _laid_out(target, chosen, "layouts of the target")
+    ]
     tables = [table(one) for one in theirs]
     found = [
         candidate
@@ -125,10 +131,9 @@ def candidates(
             kind="no_proposal",
             key="landmarks",
         )
-    held = fixed_pairs(found[0])
     for k, one in enumerate(rounds):
         at("maps tried", k, len(rounds))
-        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held)
+        found = trained(sorted(found, key=lambda c: c.cost)[: one.maps], one, held=True)
     return sorted(found, key=lambda c: c.cost)
 
 
@@ -190,13 +195,40 @@ def pose(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.asarray(left @ flip @ right)
 
 
+def _least_distorted(shape: CoarseShape, sets: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Those of the sets (S, 4) of tips that distort least; of a shape with handles cut open, half
+    of them with both stubs of a handle, which are long."""
+    order = np.argsort(scores)
+    if not len(shape.mesh.caps):
+        return sets[order[:_SOURCE_SETS]]
+    stubs = np.flatnonzero(np.isin(shape.ids[shape.tips], shape.mesh.caps)).reshape(-1, 2)
+    both = np.array([np.isin(stubs, sets[k]).all(axis=1).any() for k in order])
+    some = _SOURCE_SETS // 2
+    return sets[np.concatenate([order[both][: _SOURCE_SETS - some], order[~both][:some]])]
+
+
 def _laid_out(shape: CoarseShape, sets: np.ndarray, step: str) -> list[Layout]:
     every = [layout(shape, four) for four in counted(step, list(sets))]
     return [one for one in every if one is not None]
 
 
-def _similar_sets(ours: Sequence[Layout], target: CoarseShape) -> np.ndarray:
-    """Sets (S, 4) of the target's tips whose distances are those of one of the source's sets."""
+def _similar_sets(
+    ours: Sequence[Layout], targets: Sequence[CoarseShape]
+) -> list[tuple[CoarseShape, np.ndarray]]:
+    """Sets (S, 4) of the targets' tips whose distances are those of one of the source's sets."""
+    best = [_alike(ours, target) for target in targets]
+    limit = sorted(cost for one in best for cost in one.values())[:_TARGET_SETS][-1:]
+    found = []
+    for target, costs in zip(targets, best, strict=True):
+        kept = [four for four in sorted(costs, key=lambda f: costs[f]) if costs[four] <= limit[0]]
+        if kept:
+            found.append((target, np.array(kept[:_TARGET_SETS])))
+    return found
+
+
+def _alike(ours: Sequence[Layout], target: CoarseShape) -> dict[tuple[int, ...], float]:
+    """Sets of four of the target's tips, and by how much their distances differ from those of one
+    of the source's sets, at least."""
     apart = target.distance[np.ix_(target.tips, target.tips)]
     mean = target.mean_distance[target.tips]
     every = np.array(list(permutations(range(len(target.tips)), 4)))
@@ -210,7 +242,7 @@ def _similar_sets(ours: Sequence[Layout], target: CoarseShape) -> np.ndarray:
         cost += np.abs(shape.mean_distance[tips] - mean[orders]).mean(axis=1)
         for value, four in zip(cost.tolist(), np.sort(orders, axis=1).tolist(), strict=True):
             best[tuple(four)] = min(best.get(tuple(four), np.inf), value)
-    return np.array(sorted(best, key=lambda four: best[four])[:_TARGET_SETS]).reshape(-1, 4)
+    return best
 
 
 def _agree(ours: np.ndarray, theirs: np.ndarray, given: int) -> np.ndarray:
@@ -250,7 +282,8 @@ def changes(
 def trained(
     found: Sequence[Candidate],
     one: Round,
-    held: np.ndarray = NOTHING,
+    *,
+    held: bool = False,
     drawn: Sequence[np.ndarray] | None = None,
 ) -> list[Candidate]:
     """The candidates after a round of trainings; those of one source's layout in one batch.
@@ -258,8 +291,9 @@ def trained(
     Args:
         found: the candidates.
         one: the round.
-        held: (G, 2) vertices of source and target that all maps take near to one another.
-        drawn: (L, 2) the same of each candidate, with more force; none by default.
+        held: whether maps take landmarks that were given near to one another.
+        drawn: (L, 2) vertices of source and target, of each candidate, that are taken to one
+            another with more force; none by default.
     """
     waves = len(Sines.up_to(one.largest).waves)
     by_source: dict[int, list[int]] = {}
@@ -277,7 +311,11 @@ def trained(
             np.stack([c.matrix for c in group_]),
             np.stack([c.shift for c in group_]),
             one.largest,
-            _anchors(group_, held, [NOTHING if drawn is None else drawn[k] for k in members]),
+            _anchors(
+                group_,
+                [fixed_pairs(c) if held else NOTHING for c in group_],
+                [NOTHING if drawn is None else drawn[k] for k in members],
+            ),
         )
         start = torch.zeros(len(group_), waves, 2)
         for k, candidate in enumerate(group_):  # few waves come first among many
@@ -296,18 +334,18 @@ def trained(
 
 
 def _anchors(
-    found: Sequence[Candidate], held: np.ndarray, drawn: Sequence[np.ndarray]
+    found: Sequence[Candidate], held: Sequence[np.ndarray], drawn: Sequence[np.ndarray]
 ) -> Anchors | None:
-    count = len(held) + max(map(len, drawn))
+    count = len(held[0]) + max(map(len, drawn))
     if not count:
         return None
     points, places = np.zeros((2, len(found), count, 2))
     weights = np.zeros((len(found), count))
     shapes = np.zeros((len(found), 2, 2))
-    for k, (candidate, more) in enumerate(zip(found, drawn, strict=True)):
+    for k, (candidate, own, more) in enumerate(zip(found, held, drawn, strict=True)):
         ours, theirs = candidate.source.embedding, candidate.target.embedding
-        ids = np.concatenate([held, more])
+        ids = np.concatenate([own, more])
         points[k, : len(ids)], places[k, : len(ids)] = ours.uv[ids[:, 0]], theirs.uv[ids[:, 1]]
-        weights[k, : len(held)], weights[k, len(held) : len(ids)] = _HOLD, _DRAW
+        weights[k, : len(own)], weights[k, len(own) : len(ids)] = _HOLD, _DRAW
         shapes[k] = theirs.lattice / SIDE / np.sqrt(theirs.area)
     return Anchors(*(torch.as_tensor(a).float() for a in (points, places, shapes, weights)))

@@ -7,9 +7,8 @@ cut passes the landmarks in the same order everywhere, and a map between the dis
 order is a map of the closed shapes (after Kraevoy and Sheffer 2004, "Cross-parameterization and
 compatible remeshing of 3D models").
 
-Whether a branch separates what is left is told by homology modulo 2: by the parity of its crossings
-with a basis of closed curves on the faces (tree-cotree decomposition: Erickson and Whittlesey 2005,
-"Greedy optimal homotopy and homology generators").
+Whether a branch separates what is left is told by homology modulo 2
+(:mod:`nsm.surfaces.homology`).
 """
 
 from __future__ import annotations
@@ -19,10 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from nsm.domains.common_seams import Tracer
 from nsm.surfaces import topology
+from nsm.surfaces.homology import crossings
 
 _CLASSES = 6  # of a pair of sectors, the cheapest ones, are compared between meshes
 # cost of a difference of distances to the landmarks, at the middles of corresponding branches, in
@@ -142,48 +142,16 @@ class _Rest:
 def _crossings(tracer: Tracer) -> np.ndarray:
     """(E,) of each edge, as bits, which closed curves of a basis cross it: curves on the faces
     that no branch cuts."""
-    edges, n = topology.edges_of(tracer.faces), len(tracer.vertices)
+    edges, n = topology.edges_of(tracer.faces).pairs, len(tracer.vertices)
     on_seam = np.zeros(n, dtype=bool)
     on_seam[tracer.landmarks] = True
-    cut = np.zeros(len(edges.pairs), dtype=bool)
-    keys = edges.pairs[:, 0] * n + edges.pairs[:, 1]
+    cut = np.zeros(len(edges), dtype=bool)
+    keys = edges[:, 0] * n + edges[:, 1]
     for path in tracer.laid:
         on_seam[path] = True
         ends = np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1)
         cut[np.searchsorted(keys, ends[:, 0] * n + ends[:, 1])] = True
-    # a tree of all vertices, of which those on the seam are one
-    one = np.where(on_seam, n, np.arange(n))
-    ends = one[edges.pairs]
-    graph = csr_matrix((np.ones(len(ends)), tuple(ends.T)), shape=(n + 1, n + 1))
-    order, before = breadth_first_order(graph, n, directed=False)
-    parents = before[order[1:]].astype(np.int64)
-    wanted = np.minimum(order[1:], parents) * (n + 1) + np.maximum(order[1:], parents)
-    low, high = np.sort(ends, axis=1).T
-    both = low * (n + 1) + high
-    sorted_, first = np.unique(both, return_index=True)
-    in_tree = np.zeros(len(ends), dtype=bool)
-    in_tree[first[np.searchsorted(sorted_, wanted)]] = True
-    # a tree of all faces, over other edges; each edge that is left closes a curve
-    corners = topology.adjacent_faces(edges, ~cut & ~in_tree)
-    over = edges.of_corner.ravel()[corners[:, 0]]
-    beside = np.sort(corners // 3, axis=1)
-    count = len(tracer.faces)
-    dual = csr_matrix((np.ones(len(beside)), tuple(beside.T)), shape=(count, count))
-    order, before = breadth_first_order(dual, 0, directed=False)
-    number_of = {tuple(pair): e for pair, e in zip(beside.tolist(), over.tolist(), strict=True)}
-    step: dict[int, int] = {}  # the edge between each face and the one before it
-    for face in order[1:].tolist():
-        low, high = sorted((face, int(before[face])))
-        step[face] = number_of[low, high]
-    bits = np.zeros(len(ends), dtype=np.int64)
-    left = ~np.isin(over, list(step.values()))
-    for k, (edge, pair) in enumerate(zip(over[left].tolist(), beside[left].tolist(), strict=True)):
-        bits[edge] ^= 1 << k
-        for face in pair:
-            while face in step:
-                bits[step[face]] ^= 1 << k
-                face = int(before[face])
-    return bits
+    return crossings(tracer.faces, on_seam, cut)
 
 
 def _cheapest(rests: Sequence[_Rest]) -> tuple[int, int, list[list[int]]] | None:

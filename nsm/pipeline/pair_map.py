@@ -24,6 +24,7 @@ from nsm.pipeline.landmark_check import LandmarkCheck, check_landmarks, draw_lan
 from nsm.pipeline.parts import closed_parts
 from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
 from nsm.pipeline.resolve_inputs import (
+    Shape,
     neural_surfaces,
     read_shape,
     refuse_other_topology,
@@ -117,10 +118,25 @@ class PairMapTask(Task):
         self.check = check_landmarks(shapes, ids, self.console, repairs, self.proposed)
         self.attributes = read_attributes(settings["attributes"], counts)
         shapes = closed_parts(shapes, ids, self.domain, repairs, self.console)
+        try:
+            phi, psi = self._neural(shapes, ids)
+        except NsmError as error:
+            if self.proposed is None or error.kind != "no_common_seam":
+                raise
+            self.console.print(f"no landmarks are proposed: {error}", soft_wrap=True)
+            ids = [one[: self.proposed.given] for one in ids]
+            self.proposed, self.check = None, None
+            phi, psi = self._neural(shapes, ids)
+        self.use(phi, psi, ids)
+
+    def _neural(
+        self, shapes: Sequence[Shape], ids: Sequence[np.ndarray]
+    ) -> tuple[NeuralSurface, NeuralSurface]:
+        """Source and target, laid out and overfitted, with landmarks (L,) of each."""
         draw = partial(draw_landmarks, self.folder, landmarks=ids)
         cones = None if self.check is None or self.domain.has_boundary else self.check.cones
         phi, psi = neural_surfaces(self.config, shapes, ids, self.console, draw, cones)
-        self.use(phi, psi, ids)
+        return phi, psi
 
     def use(self, phi: NeuralSurface, psi: NeuralSurface, ids: Sequence[np.ndarray]) -> None:
         """Take source and target, and the landmarks as vertices (L,) of their mesh files."""

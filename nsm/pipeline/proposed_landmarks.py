@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nsm.correspondence import proposed, proposed_for_all
-from nsm.domains import DOMAINS, Domain
+from nsm.domains import Automatic, Domain
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
 from nsm.pipeline.configured_surface import configured_repairs
@@ -22,7 +22,7 @@ from nsm.pipeline.resolve_inputs import Shape
 from nsm.stages import stage
 from nsm.surfaces.landmark_files import to_json
 from nsm.surfaces.landmarks import kept_landmarks
-from nsm.surfaces.topology import boundary_loops
+from nsm.surfaces.topology import genus_and_boundary
 from nsm.surfaces.validation import CleanMesh
 from nsm.wording import number_of
 
@@ -128,9 +128,9 @@ def given_or_proposed(
 ) -> tuple[list[Shape], list[np.ndarray], ProposedLandmarks | None]:
     """The landmarks of a map: those given, those proposed, or both.
 
-    Landmarks are proposed if they are ``auto``; and on the orbifold for meshes if none are given,
-    or one to eight, which are completed. Four are enough for common cones: unsure ones do not come
-    to them.
+    Landmarks are proposed if they are ``auto``; and for closed meshes, on the domain that suits
+    them, if none are given, or one to eight, which are completed; of meshes with handles for two,
+    and up to four. Four are enough for common cones: unsure ones do not come to them.
 
     Args:
         landmarks: as :func:`nsm.pipeline.landmark_inputs.landmark_vertices` takes them, or
@@ -185,14 +185,14 @@ def given_or_proposed(
                     kept_landmarks(shape.cleaned(repairs), own, shape.name)
     some_lack = any((of_one < 0).any() for of_one in ids)
     few = settings.complete and 1 <= len(ids[0]) <= _COMPLETED and not some_lack
-    possible = len(meshes) == len(shapes) and domain == DOMAINS["orbifold"]
+    possible = len(meshes) == len(shapes)
     if not (asked or (possible and (none or few))):
+        return list(shapes), ids, None
+    cleaned = [mesh.cleaned(repairs) for mesh in meshes]
+    if not asked and not _proposed_for(cleaned, domain, len(ids[0])):
         return list(shapes), ids, None
     what = "landmarks" if none else "further landmarks"
     with stage(console, f"proposing {what} of {', '.join(mesh.name for mesh in meshes)}"):
-        cleaned = [mesh.cleaned(repairs) for mesh in meshes]
-        if not asked and any(boundary_loops(mesh.faces) for mesh in cleaned):
-            return list(shapes), ids, None
         try:
             found = _proposal(cleaned, ids, settings.alternative)
         except NsmError as error:
@@ -218,6 +218,16 @@ def given_or_proposed(
         )
     console.print(found.said if found.warning is None else found.warning, soft_wrap=True)
     return list(shapes), found.landmarks, replace(found, places=known)
+
+
+def _proposed_for(meshes: Sequence[CleanMesh], domain: Domain, given: int) -> bool:
+    """Whether landmarks are proposed though they were not asked for: for closed meshes on the
+    domain that suits them, and where surfaces have handles, for two of them with few landmarks."""
+    topologies = {genus_and_boundary(mesh.faces) for mesh in meshes}
+    if len(topologies) > 1 or Automatic().chosen(topologies) != domain:
+        return False
+    ((genus, loops),) = topologies
+    return not loops and (not genus or (len(meshes) == 2 and given <= _ENOUGH))
 
 
 def _proposal(

@@ -99,7 +99,7 @@ def test_a_turned_and_stretched_shape_is_recognised(pair, quick):
 def test_nothing_is_sure_where_all_is_alike(quick, monkeypatch):
     """Twelve rotations are equally good: far from each other, and with other limbs exchanged."""
     shape = coarse_shape(*tetrapod())
-    found = proposal.candidates(shape, shape)
+    found = proposal.candidates(shape, [shape])
     monkeypatch.setattr(proposal, "candidates", lambda *_: found)
     for apart in (0.2, np.inf):  # in the mean; at last the limbs alone tell maps from each other
         monkeypatch.setattr(proposal, "_DIFFERENT", apart)
@@ -248,9 +248,7 @@ def test_finer_maps_tell_the_right_one_of_two_that_hardly_differ(
     source, target, _ = pair
     first, second = two_maps
     candidates = [second.candidate, first.candidate]
-    scores = finer_maps.finer_scores(
-        (source, target), candidates, [second.vertices, first.vertices]
-    )
+    scores = finer_maps.finer_scores(candidates, [second.vertices, first.vertices])
     assert np.isfinite(scores).all() and scores[1] < scores[0]
     # a tie, with the wrong one ahead
     tie = [
@@ -296,16 +294,16 @@ def test_near_ties_of_a_collection_are_decided_by_finer_maps(pair, two_maps, mon
     tie = [replace(second, score=1.0, whole=True), replace(first, score=1.1, whole=True)]
     seen = []
 
-    def finer(meshes, found, drawn):
-        seen.append(meshes[1])
-        assert np.array_equal(meshes[0][0], source[0]) and len(found) == len(drawn) == 2
+    def finer(found, drawn):
+        seen.append(found[0].target.shape.mesh)
+        assert found[0].source.shape.mesh.vertices is source[0] and len(found) == len(drawn) == 2
         return np.array([3.0 if one is second.candidate else 2.0 for one in found])
 
     monkeypatch.setattr(proposal, "finer_scores", finer)
     monkeypatch.setattr(collection_proposal, "hub_of", lambda _: 0)
     monkeypatch.setattr(collection_proposal, "hypotheses", lambda *_: list(tie))
     found = proposed_for_all([source, target, target])
-    assert len(seen) == 2 and all(mesh is target for mesh in seen)
+    assert len(seen) == 2 and all(mesh.vertices is target[0] for mesh in seen)
     assert set(map(tuple, found.vertices[0][:, :2])) == set(map(tuple, first.vertices))
     assert np.array_equal(found.vertices[0][:, 1], found.vertices[0][:, 2])
     assert found.margin == pytest.approx(0.1) and not found.sure  # as the coarse maps have it

@@ -17,10 +17,11 @@ from nsm.correspondence import CollectionProposal, Hypothesis, Proposal
 from nsm.domains import DOMAINS, Surface
 from nsm.domains.joint_preparation import Mesh
 from nsm.errors import NsmError
-from nsm.pipeline import proposed_landmarks
-from nsm.pipeline.proposed_landmarks import given_or_proposed
+from nsm.pipeline import pair_map, proposed_landmarks
+from nsm.pipeline.proposed_landmarks import ProposedLandmarks, given_or_proposed
+from nsm.pipeline.task import Given
 from nsm.surfaces.landmark_files import read_collection, read_pairs
-from nsm.surfaces.shapes import sphere
+from nsm.surfaces.shapes import sphere, torus
 
 
 def meshes():
@@ -46,7 +47,7 @@ def answers(monkeypatch, margin, score=2.0):
     monkeypatch.setattr(proposed_landmarks, "proposed", completed)
 
 
-ORBIFOLD, DISC = DOMAINS["orbifold"], DOMAINS["disc"]
+ORBIFOLD, TORUS, DISC = (DOMAINS[name] for name in ("orbifold", "torus", "disc"))
 
 
 def take(landmarks, *words, shapes=None, domain=ORBIFOLD):
@@ -260,3 +261,47 @@ def test_the_search_is_told_while_it_lasts(monkeypatch):
     monkeypatch.setattr(stages, "QUIET_FOR", 0.05)
     _, _, said = take("auto")
     assert said.count("proposing landmarks of a, b") >= 2
+
+
+def test_two_rings_have_landmarks_proposed_and_up_to_four_completed(monkeypatch):
+    answers(monkeypatch, 0.5)
+    rings = [Mesh(name, *torus(24, 12)) for name in "ab"]
+    assert take(None, shapes=rings, domain=TORUS)[1]
+    assert take("auto", shapes=rings, domain=DISC)[1]
+    assert take(None, shapes=rings, domain=DISC)[1] is None
+    pairs = [[100 + k, 101 + k] for k in range(5)]
+    assert take(pairs[:4], shapes=rings, domain=TORUS)[1].given == 4
+    assert take(pairs, shapes=rings, domain=TORUS)[1] is None
+    three = [*rings, Mesh("c", *torus(24, 12))]
+    assert take(None, shapes=three, domain=TORUS)[1] is None
+    assert take(None, shapes=[rings[0], meshes()[0]], domain=DISC)[1] is None
+
+
+@pytest.mark.parametrize("given", [0, 1])
+def test_a_proposal_without_common_seams_is_left_out(given, monkeypatch):
+    ids = [np.arange(4), np.arange(4) + 10]
+    found = ProposedLandmarks([np.stack(ids, axis=1)], [1.0], 0.1, False, given, 0)
+    seen = []
+
+    def surfaces(config, shapes, landmarks, console, *_):
+        seen.append([one.tolist() for one in landmarks])
+        if len(landmarks[0]) > given:
+            raise NsmError("no seams", kind="no_common_seam", key="landmarks")
+        return ["phi", "psi"]
+
+    monkeypatch.setattr(pair_map, "given_or_proposed", lambda *_, **__: (meshes(), ids, found))
+    monkeypatch.setattr(pair_map, "check_landmarks", lambda *_: None)
+    monkeypatch.setattr(pair_map, "closed_parts", lambda shapes, *_: shapes)
+    monkeypatch.setattr(pair_map, "neural_surfaces", surfaces)
+    task = pair_map.PairMapTask("pair_map")
+    console = Console(record=True, width=200)
+    task.setup(compose_config(["task=pair_map", "domain=disc"]), console)
+    used = []
+    monkeypatch.setattr(task, "use", lambda *what: used.append(what))
+    first, second = ((mesh.vertices, mesh.faces) for mesh in meshes())
+    task.prepare(Given(source=first, target=second))
+    kept = [list(range(given)), list(range(10, 10 + given))]
+    assert seen == [[ids[0].tolist(), ids[1].tolist()], kept]
+    assert task.proposed is None and "no landmarks are proposed: no seams" in console.export_text()
+    assert used[0][:2] == ("phi", "psi")
+    assert [one.tolist() for one in used[0][2]] == kept
