@@ -51,8 +51,13 @@ class CoarseShape:
     given: int = 0
 
     @property
+    def given_landmarks(self) -> int:
+        """How many of the tips are landmarks that were given; caps come after them."""
+        return self.given - len(self.mesh.caps)
+
+    @property
     def fixed(self) -> np.ndarray:
-        """The vertices (given,) of landmarks that were given."""
+        """The vertices (given,) of landmarks that were given, and of caps."""
         return self.tips[: self.given]
 
     def peaks(self) -> np.ndarray:
@@ -104,6 +109,7 @@ def coarse_shape(
             kind="wrong_topology",
             key="landmarks",
         )
+    mesh = Opened.uncut(vertices, faces) if opened is None else opened
     given = 0 if fixed is None else len(fixed)
     if tips is None:
         tips = tips_of(vertices, faces, _TIPS)
@@ -111,7 +117,7 @@ def coarse_shape(
             unit = np.sqrt(topology.face_areas(vertices, faces).sum())
             apart = edge_distances(vertices, faces, fixed)[:, tips].min(axis=0) / unit
             others = tips[apart > _NEAR]
-            if given - (0 if opened is None else len(opened.caps)) < COMMON:
+            if given - len(mesh.caps) < COMMON:
                 others = others[: _MOST - given]
             tips = np.concatenate([fixed, others])
     if len(tips) < 4:
@@ -135,7 +141,7 @@ def coarse_shape(
         distance @ corner,
         tips,
         _spread(distance, tips.tolist(), min(_SAMPLES, len(ids))),
-        Opened.uncut(vertices, faces) if opened is None else opened,
+        mesh,
         given,
     )
 

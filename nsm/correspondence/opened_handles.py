@@ -194,10 +194,8 @@ def _opened(vertices: np.ndarray, faces: np.ndarray, loops: Sequence[np.ndarray]
         return None
     edges = topology.edges_of(faces).pairs
     ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
-    low, high = np.sort(ends, axis=1).T
     is_cut = np.zeros(len(edges), dtype=bool)
-    keys = edges[:, 0] * len(vertices) + edges[:, 1]
-    is_cut[np.searchsorted(keys, low * len(vertices) + high)] = True
+    is_cut[topology.edges_between(edges, ends)] = True
     cut, origin = topology.cut_along(faces, is_cut)
     points, parts = [vertices[origin]], [cut]
     caps = len(origin) + np.arange(2 * len(loops))

@@ -107,7 +107,7 @@ def candidates(
         NsmError: ``no_proposal``: no map meets the landmarks that are given; ``not_injective``:
             of five or more, all fours are too close to each other.
     """
-    if source.given - len(source.mesh.caps) >= COMMON:
+    if source.given_landmarks >= COMMON:
         found = through_four(source, targets[0], np.arange(source.given))
         drawn = [fixed_pairs(found[0])] * len(found)
         return sorted(trained(found, _THROUGH, drawn=drawn), key=lambda c: c.cost)

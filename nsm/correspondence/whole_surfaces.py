@@ -101,9 +101,8 @@ def on_whole(
     found = np.concatenate([pairs[~on_caps[0] & ~on_caps[1]], _on_tubes(candidate)])
     found = np.concatenate([found, _between(candidate, found, least - len(found))])
     ends = np.stack([shape.mesh.origin[found[:, k]] for k, shape in enumerate(shapes)], axis=1)
-    caps = len(shapes[0].mesh.caps)
-    if caps > 2:
-        free = slice(shapes[0].given - caps, None)
+    if len(shapes[0].mesh.caps) > 2:
+        free = slice(shapes[0].given_landmarks, None)
         for k, (_, faces) in enumerate(meshes):
             ends[free, k] = with_room(faces)[ends[free, k]]
     # each vertex once
@@ -130,8 +129,7 @@ def _on_tubes(candidate: Candidate) -> np.ndarray:
     """Of each handle a pair (g, 2) of vertices of the meshes, on the curves along which its tubes
     were cut, that the map brings nearest to each other."""
     source, target = candidate.source.shape, candidate.target.shape
-    first = source.given - len(source.mesh.caps)
-    ours, theirs = source.fixed[first:], target.fixed[first:]
+    ours, theirs = (shape.fixed[shape.given_landmarks :] for shape in (source, target))
     found, costs = [], []
     for cap, its_cap in zip(ours.tolist(), theirs.tolist(), strict=True):
         around = np.setdiff1d(source.faces[(source.faces == cap).any(axis=1)], [cap])

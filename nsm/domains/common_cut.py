@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nsm.domains.base import BoundedDomain, Keys
-from nsm.domains.common_handles import open_handles
+from nsm.domains.common_handles import with_handles_opened
 from nsm.domains.common_seams import (
     SEAMS,
     aligned_keys,
@@ -18,7 +18,6 @@ from nsm.domains.common_seams import (
     mutually_far,
     seam_costs,
     tracers_of,
-    with_nodes_between,
 )
 from nsm.domains.disc import Disc
 from nsm.errors import NsmError
@@ -32,9 +31,6 @@ from nsm.surfaces.validation import CleanMesh
 # seam=auto tries seams through these shares of the landmarks
 SHARES = (0.33, 0.45, 0.55, 0.67, 1.0)
 _DISC = Disc()  # where seams are compared, whatever the domain
-# parts of a branch between landmarks, one after the other until there is room: where few edges meet
-# at few landmarks, the branches that open handles leave from between these too
-_PIECES = (1, 2, 4, 8)
 _WORST = 1e3  # upper bound on a triangle's distortion
 
 
@@ -115,15 +111,9 @@ def _common_cut(
     chosen = mutually_far(pairs, landmarks, count)
     on_seam = [ids[chosen] for ids in landmarks]
     avoid = [np.concatenate([ids, more]) for ids, more in zip(landmarks, others, strict=True)]
-    tracers = tracers_of(pairs, on_seam, costs, avoid)
-    if not lead_tree(tracers):
-        return None
-    tree = tracers
-    for pieces in _PIECES:
-        tracers = with_nodes_between(tree, pieces)
-        if open_handles(tracers):
-            break
-    else:
+    tree = tracers_of(pairs, on_seam, costs, avoid)
+    tracers = with_handles_opened(tree) if lead_tree(tree) else None
+    if tracers is None:
         return None
     cuts = [
         cut_along_paths(c.vertices, c.faces, t.laid, name=name)

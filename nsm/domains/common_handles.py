@@ -20,10 +20,13 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from nsm.domains.common_seams import Tracer
+from nsm.domains.common_seams import Tracer, with_nodes_between
 from nsm.surfaces import topology
 from nsm.surfaces.homology import crossings
 
+# parts of a branch between landmarks, one after the other until there is room: where few edges meet
+# at few landmarks, the branches that open handles leave from between these too
+_PIECES = (1, 2, 4, 8)
 _CLASSES = 6  # of a pair of sectors, the cheapest ones, are compared between meshes
 # cost of a difference of distances to the landmarks, at the middles of corresponding branches, in
 # units of their lengths: without it, a branch may run through another handle on another mesh
@@ -38,6 +41,22 @@ class _Way(NamedTuple):
     cost: float
     path: list[int]
     middle: np.ndarray
+
+
+def with_handles_opened(tree: Sequence[Tracer]) -> Sequence[Tracer] | None:
+    """The branches of a tree on closed meshes of one genus, and further ones that leave a disc; or
+    None: there are no such.
+
+    Args:
+        tree: of each mesh; it stays as it is.
+    """
+    if topology.genus_and_boundary(tree[0].faces)[0] == 0:
+        return tree
+    for pieces in _PIECES:
+        tracers = with_nodes_between(tree, pieces)
+        if open_handles(tracers):
+            return tracers
+    return None
 
 
 def open_handles(tracers: Sequence[Tracer]) -> bool:
@@ -142,15 +161,13 @@ class _Rest:
 def _crossings(tracer: Tracer) -> np.ndarray:
     """(E,) of each edge, as bits, which closed curves of a basis cross it: curves on the faces
     that no branch cuts."""
-    edges, n = topology.edges_of(tracer.faces).pairs, len(tracer.vertices)
-    on_seam = np.zeros(n, dtype=bool)
+    edges = topology.edges_of(tracer.faces).pairs
+    on_seam = np.zeros(len(tracer.vertices), dtype=bool)
     on_seam[tracer.landmarks] = True
     cut = np.zeros(len(edges), dtype=bool)
-    keys = edges[:, 0] * n + edges[:, 1]
     for path in tracer.laid:
         on_seam[path] = True
-        ends = np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1)
-        cut[np.searchsorted(keys, ends[:, 0] * n + ends[:, 1])] = True
+        cut[topology.edges_between(edges, np.stack([path[:-1], path[1:]], axis=1))] = True
     return crossings(tracer.faces, on_seam, cut)
 
 

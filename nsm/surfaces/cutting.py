@@ -171,6 +171,7 @@ def disc_seam(
     euler = topology.euler_characteristic(faces)
     genus = (2 - euler - len(graph.loops)) // 2
     terminals = [int(loop.min()) for loop in graph.loops]
+    chosen = seam_vertices is None and almost_closed(vertices, faces, graph.loops)
     if seam_vertices is not None:
         for v in seam_vertices:
             if not 0 <= int(v) < len(vertices):
@@ -182,13 +183,13 @@ def disc_seam(
         if not graph.loops and genus == 0 and len(terminals) < 2:
             reason = "the surface is closed; give at least two different seam vertices"
             raise _seam_error(name, "too_few", reason)
-    elif genus == 0 and almost_closed(vertices, faces, graph.loops):
+    elif genus == 0 and chosen:
         farthest = _farthest_points(graph, terminals, FARTHEST_POINTS)
         terminals += [v for v in farthest if v not in terminals]
         log.append(f"seam through {number_of(len(farthest), 'farthest point')}")
 
     seam = _shortest_seam(graph, edges, terminals, genus)
-    if seam_vertices is None and almost_closed(vertices, faces, graph.loops):
+    if chosen:
         seam, limbs = _led_into_limbs(graph, vertices, faces, seam)
         if limbs:
             log.append(f"seam led on to {number_of(limbs, 'tip')} of limbs")
@@ -208,11 +209,9 @@ def cut_along_paths(
     Raises:
         NsmError: ``not_a_disc``, with the key ``surface.seam_vertices``.
     """
-    edges = topology.edges_of(faces)
-    keys = edges.pairs[:, 0] * len(vertices) + edges.pairs[:, 1]  # sorted
-    steps = [np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1) for path in paths]
-    low, high = np.concatenate(steps).astype(np.int64).T
-    seam = np.searchsorted(keys, low * len(vertices) + high).tolist()
+    steps = [np.stack([path[:-1], path[1:]], axis=1) for path in paths]
+    ends = np.concatenate(steps).astype(np.int64)
+    seam = topology.edges_between(topology.edges_of(faces).pairs, ends).tolist()
     log = [f"cut along {number_of(len(seam), 'edge')} in {number_of(len(paths), 'path')}"]
     return cut_open(vertices, faces, seam, log, name)
 

@@ -36,6 +36,14 @@ def edges_of(faces: np.ndarray) -> Edges:
     return Edges(pairs, inverse.reshape(-1, 3), count)
 
 
+def edges_between(pairs: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """The numbers (N,) of the edges between vertices (N, 2), among those (E, 2) of
+    :func:`edges_of`."""
+    count = int(pairs.max()) + 1
+    low, high = np.sort(ends, axis=1).T
+    return np.searchsorted(pairs[:, 0] * count + pairs[:, 1], low * count + high)
+
+
 def adjacent_faces(edges: Edges, keep: np.ndarray | None = None) -> np.ndarray:
     """The two corners 3f + k (N, 2) at which each edge with two faces starts.
 
