@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass, field
+from statistics import median
 from typing import TypeVar
 from weakref import WeakSet
 
@@ -40,6 +42,48 @@ class _Heard(RenderHook):
 _heard = _Heard()
 
 
+@dataclass
+class _Count:
+    """Steps of the work: which one it is at, and how long they took.
+
+    The one after ``done`` of ``total``, if they are counted; ``early``: it may be the last. The
+    last report was of ``last`` steps, of ``pace`` seconds each, those before it of ``before``.
+    """
+
+    step: str = ""
+    done: int = 0
+    total: int = 0
+    early: bool = False
+    started: float = field(default_factory=time.monotonic)
+    ended: float = field(default_factory=time.monotonic)
+    last: int = 1
+    pace: float = 0.0
+    before: float = 0.0
+
+    def move(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done > self.done:
+            self.before, self.last = self.pace, done - self.done
+            self.pace = (now - self.ended) / self.last
+            self.ended = now
+        self.done, self.total = done, total
+
+    @property
+    def seconds(self) -> float:
+        """Of a step from here on: they may take longer than those before, if two in turn did."""
+        mean = (self.ended - self.started) / self.done
+        return max(mean, median((self.before, self.pace, self.elapsed / self.last)))
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the last step ended."""
+        return time.monotonic() - self.ended
+
+    @property
+    def known(self) -> bool:
+        return 0 < self.done < self.total
+
+
 class Stage:
     """A piece of work, and pieces within it, and the step that the innermost is at.
 
@@ -49,41 +93,49 @@ class Stage:
 
     def __init__(self, title: str = "") -> None:
         self.titles = [title] if title else []
-        self.step, self.figures, self.done, self.total = "", "", 0, 0
-        self.started = self.step_started = self.step_ended = time.monotonic()
-        self.last, self.pace = 1, 0.0  # steps between the last two reports, and seconds for each
+        self.count, self.outer, self.figures = _Count(), list[_Count](), ""
+        self.started = time.monotonic()
         self._ended = threading.Event()
 
-    def at(self, step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
+    def at(
+        self, step: str, done: int = 0, total: int = 0, figures: str = "", early: bool = False
+    ) -> None:
         """Say which step the work is at: the one after ``done`` of ``total``, if it is counted;
-        and figures that tell how it goes."""
-        now = time.monotonic()
-        if step != self.step or done < self.done:
-            self.step_started, self.last, self.pace = now, 1, 0.0
-        elif done > self.done:
-            self.last = done - self.done
-            self.pace = (now - self.step_ended) / self.last
-        if done != self.done:
-            self.step_ended = now
-        self.step, self.done, self.total, self.figures = step, done, total, figures
+        figures that tell how it goes; and whether it may end early."""
+        if step != self.count.step or done < self.count.done:
+            self.count = _Count(step, done, total)
+        self.count.move(done, total)
+        self.count.early, self.figures = early, figures
 
     def text(self, seconds: bool = True) -> str:
-        """Titles, step, ``seconds`` so far, the time left of a step that is counted, figures."""
-        now = time.monotonic()
-        so_far = f"{now - self.started:.0f} s" if seconds else ""
-        parts = [*self.titles, self.numbered_step(), so_far]
-        if 0 < self.done < self.total:
-            # steps may take longer from here on: so do those left, if two of them in turn did
-            mean = (self.step_ended - self.step_started) / self.done
-            slow = min(self.pace, (now - self.step_ended) / self.last)
-            left = max(mean, slow) * (self.total - self.done)
-            parts.append(f"about {max(left, 1):.0f} s left")
-        return "  ".join(part for part in (*parts, self.figures) if part)
+        """Titles, step, ``seconds`` so far, the time left of steps that are counted, figures."""
+        so_far = f"{time.monotonic() - self.started:.0f} s" if seconds else ""
+        parts = (*self.titles, self.numbered_step(), so_far, self._left(), self.figures)
+        return "  ".join(part for part in parts if part)
+
+    def _left(self) -> str:
+        """The time left of all steps that are counted; nothing where one of them is the first."""
+        counts = [count for count in (*self.outer, self.count) if count.total]
+        if not counts or not all(count.known for count in counts[:-1]):
+            return ""
+        *outer, inner = counts
+        if inner.known:
+            left = inner.seconds * (inner.total - inner.done)
+        elif outer and inner.done == 0:
+            left = max(outer[-1].seconds - outer[-1].elapsed, 0.0)
+        elif outer:
+            left = 0.0
+        else:
+            return ""
+        left += sum(count.seconds * (count.total - count.done - 1) for count in outer)
+        how = "up to" if any(count.early for count in counts) else "about"
+        return f"{how} {max(left, 1):.0f} s left"
 
     def numbered_step(self) -> str:
         """The step that the work is at, with its number if steps are counted."""
-        number = f" {min(self.done + 1, self.total)}/{self.total}" if self.total else ""
-        return self.step + number
+        count = self.count
+        number = f" {min(count.done + 1, count.total)}/{count.total}" if count.total else ""
+        return count.step + number
 
     def show(self, console: Console) -> None:
         """Show it until it ends: a line that is updated on a terminal, plain lines elsewhere."""
@@ -119,9 +171,11 @@ class _Reported(Stage):
         super().__init__()
         self.send, self.sent = send, 0.0
 
-    def at(self, step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
-        new = step != self.step
-        super().at(step, done, total, figures)
+    def at(
+        self, step: str, done: int = 0, total: int = 0, figures: str = "", early: bool = False
+    ) -> None:
+        new = step != self.count.step
+        super().at(step, done, total, figures, early)
         now = time.monotonic()
         if new or now - self.sent > _OFTEN:
             self.sent = now
@@ -158,15 +212,15 @@ def part(title: str) -> Iterator[None]:
     if outer is None:
         yield
         return
-    before = outer.step, outer.done, outer.total
-    titles = outer.titles
-    outer.titles = [*titles, *([outer.numbered_step()] if outer.total else []), title]
-    outer.at("")
+    before, titles, figures = outer.count, outer.titles, outer.figures
+    outer.titles = [*titles, *([outer.numbered_step()] if before.total else []), title]
+    outer.outer.append(before)
+    outer.count, outer.figures = _Count(), ""
     try:
         yield
     finally:
-        outer.titles = titles
-        outer.at(*before)
+        outer.outer.pop()
+        outer.count, outer.titles, outer.figures = before, titles, figures
 
 
 def report_to(send: Callable[[str], None]) -> None:
@@ -183,11 +237,11 @@ def showing() -> bool:
     return _current.get() is not None
 
 
-def at(step: str, done: int = 0, total: int = 0, figures: str = "") -> None:
+def at(step: str, done: int = 0, total: int = 0, figures: str = "", early: bool = False) -> None:
     """Say which step the work is at (see :meth:`Stage.at`); without a stage, nothing happens."""
     shown = _current.get()
     if shown is not None:
-        shown.at(step, done, total, figures)
+        shown.at(step, done, total, figures, early)
 
 
 def counted(step: str, items: Sequence[T]) -> Iterator[T]:

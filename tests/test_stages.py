@@ -74,15 +74,15 @@ def test_parts_are_named_and_the_step_before_them_comes_back():
 
 
 def later(begun, seconds):
-    begun.step_started -= seconds
-    begun.step_ended -= seconds
+    begun.count.started -= seconds
+    begun.count.ended -= seconds
 
 
 def test_steps_that_take_longer_than_those_before_them_are_awaited():
     begun = stages.Stage("work")
     begun.at("steps", 1, 4)
     begun.at("steps", 2, 4)
-    begun.step_started -= 4  # two steps, two seconds each
+    begun.count.started -= 4  # two steps, two seconds each
     assert "about 4 s left" in begun.text()
     later(begun, 30)  # one slow step says nothing of the others
     assert "about 4 s left" in begun.text()
@@ -91,6 +91,23 @@ def test_steps_that_take_longer_than_those_before_them_are_awaited():
     assert "about 20 s left" in begun.text()
     begun.at("steps", 4, 4)
     assert "left" not in begun.text()
+
+
+def test_steps_after_the_present_one_count_and_may_be_the_last():
+    begun = stages.Stage("work")
+    token = stages._current.set(begun)
+    try:
+        begun.at("step", 2, 4, early=True)
+        begun.count.started -= 10  # two steps, five seconds each
+        with stages.part("inner"):
+            begun.at("iteration", 1, 3)
+            begun.count.started -= 1
+            # two iterations, and the step after this one
+            assert "up to 7 s left" in begun.text()
+        begun.at("step", 3, 4)  # ten seconds for three steps
+        assert "about 3 s left" in begun.text()
+    finally:
+        stages._current.reset(token)
 
 
 def test_steps_that_are_reported_together_share_their_time():
@@ -136,7 +153,9 @@ def test_other_processes_say_what_they_are_at(often):
 def test_a_training_says_its_step_while_that_lasts(often):
     console = Console(file=io.StringIO(), width=200)
     progress = TrainingProgress(console, "training")
-    trainer = SimpleNamespace(global_step=1, max_steps=5, callback_metrics={"val/rms_percent": 2.0})
+    trainer = SimpleNamespace(
+        global_step=1, max_steps=5, should_stop=False, callback_metrics={"val/rms_percent": 2.0}
+    )
     progress.on_train_start(trainer, None)
     progress.shown -= 1
     progress.on_train_batch_end(trainer, None, {"loss": 0.5}, None, 0)
@@ -147,6 +166,15 @@ def test_a_training_says_its_step_while_that_lasts(often):
     assert not stages.showing()
     lines = [line for line in console.file.getvalue().splitlines() if "2/5" in line]
     assert len(lines) >= 3 and "loss 5.00e-01  error 2.000 %" in lines[-1]
+
+
+def test_a_training_that_ends_early_says_so():
+    console = Console(file=io.StringIO(), width=200)
+    progress = TrainingProgress(console, "training")
+    trainer = SimpleNamespace(global_step=3, max_steps=5, should_stop=True, callback_metrics={})
+    progress.on_train_start(trainer, None)
+    progress.on_train_end(trainer, None)
+    assert "training: settled after 3 steps, of 5 at most" in console.file.getvalue()
 
 
 def test_works_in_turn_are_counted_and_named(monkeypatch):

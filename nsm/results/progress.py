@@ -93,12 +93,19 @@ class TrainingProgress(Callback):
             if self.bar is not None and self.task is not None:
                 self.bar.update(self.task, completed=step, figures=self.figures)
         if self.within is not None:
-            at("step", step, trainer.max_steps, self.figures)
+            early = getattr(pl_module, "may_end_early", False)
+            at("step", step, trainer.max_steps, self.figures, early)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         if self.bar is not None and self.task is not None:
             self.bar.update(self.task, completed=trainer.global_step)
         self._stop()
+        if trainer.should_stop and trainer.global_step < trainer.max_steps and not self.transient:
+            self.console.print(
+                f"{self.title}: settled after {trainer.global_step} steps, of "
+                f"{trainer.max_steps} at most",
+                soft_wrap=True,
+            )
 
     def on_exception(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException

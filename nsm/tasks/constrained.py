@@ -135,6 +135,10 @@ class ConstrainedMap(AtTriangles):
         return self.loss_weights.landmarks * share
 
     @property
+    def may_end_early(self) -> bool:
+        return super().may_end_early and self.global_step >= self.triangles_from
+
+    @property
     def held(self) -> Tensor:
         """Mask (..., K) of the landmarks that the map should meet."""
         return self.there & ~self.lost

@@ -39,6 +39,12 @@ class Training(Microbatching):
     batch: Any = None
     figures: Mapping[str, Tensor] | None = None
 
+    @property
+    def may_end_early(self) -> bool:
+        """Whether the steps to come end where they no longer gain much."""
+        optimizer = self.trainer.optimizers[0]
+        return isinstance(optimizer, QuasiNewton) and optimizer.on_last_level
+
     def pointwise(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
     ) -> tuple[Tensor, ...]:
