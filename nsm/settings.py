@@ -410,6 +410,8 @@ class ParamConstraints(Checked):
             smooth.
         triangles_from: share of the steps after which the training measures distortion at triangles
             of the source's mesh, as figures do, instead of samples.
+        settled: relative change of the distortion below which quasi-Newton steps at triangles end;
+            0: never.
     """
 
     boundary: Literal["free", "apart", "fixed"]
@@ -438,6 +440,8 @@ class PairConstraints(Checked):
             smooth.
         triangles_from: share of the steps after which the training measures distortion at triangles
             of the source's mesh, as figures do, instead of samples.
+        settled: relative change of the distortion below which quasi-Newton steps at triangles end;
+            0: never.
     """
 
     boundary: Literal["exact", "penalty"]
@@ -450,6 +454,7 @@ class PairConstraints(Checked):
     multipliers_from: Share = 0.0
     injectivity: Literal["exponential", "smooth"] = "exponential"
     triangles_from: Share = 1.0
+    settled: Share = 1e-3
 
 
 @dataclass(frozen=True)
@@ -472,6 +477,7 @@ class CollectionConstraints(PairConstraints):
             smooth.
         triangles_from: share of the steps after which quasi-Newton steps measure distortion at
             triangles of all surfaces' meshes, and move one h_i after the other.
+        settled: relative change of the distortion below which these steps end; 0: never.
         pairs: sum: distortion is summed over all ordered pairs, the other terms over the surfaces;
             mean: distortion is the mean over the pairs, and the others weigh as with four surfaces.
     """

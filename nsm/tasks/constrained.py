@@ -22,8 +22,6 @@ _ON_BOUNDARY = 1e-6
 _FIRST = 1e-3
 # factor of λ_C at triangles, where few steps are left to meet the landmarks
 _LAST = 10.0
-# relative change of the distortion in a quasi-Newton step, below which the next ones gain little
-_SETTLED = 1e-3
 _MET = 0.02  # in percent of the target's diagonal: landmarks that are nearer are met
 # in units of Ω: where there is a seam, a landmark that is farther off once λ_C is in full lies on
 # the other side of it; more force only folds the map
@@ -45,9 +43,9 @@ class ConstrainedMap(AtTriangles):
     multipliers hold no landmark that is still far off, and where the steps at triangles begin, such
     a one is let go: it is missed, which figures tell, and the others are met without folds.
 
-    Quasi-Newton steps at triangles end where a step changes the distortion by less than 0.1 %, all
-    landmarks are met, and no fewer triangles are flipped than before it: maps of like shapes take
-    few.
+    Quasi-Newton steps at triangles end where a step changes the distortion by less than
+    ``constraints.settled``, all landmarks are met, and no fewer triangles are flipped than before
+    it: maps of like shapes take few.
 
     Subclasses set ``map``, call ``set_landmarks``, keep the distortion of each evaluation in
     ``distortion``, and define ``flipped_percent`` and ``landmark_error``.
@@ -204,7 +202,7 @@ class ConstrainedMap(AtTriangles):
             flipped = self.flipped_percent()
         opening = bool(flipped < self.flipped)
         self.reached, self.flipped = self.distortion.to(self.reached), flipped
-        if change < _SETTLED and not missed and not opening:
+        if change < self.constraints.settled and not missed and not opening:
             self.settled.fill_(True)
             self.trainer.should_stop = True
 
