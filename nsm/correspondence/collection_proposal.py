@@ -2,28 +2,32 @@
 
 Every surface is matched with a hub. Which of the hypotheses are taken is decided for all surfaces
 together: two maps from the hub also make one between their targets, which has its own change of
-distances and its own rigid residual. Near ties of a member's maps are decided by finer maps.
+distances and its own rigid residual. Near ties of a member's maps are decided by finer maps. Ends
+of small limbs come to landmarks that are sure, as they do for pairs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
+from nsm.correspondence.further_ends import further_ends
 from nsm.correspondence.joint_choice import Way, ways
 from nsm.correspondence.layouts import quick_scores
 from nsm.correspondence.proposal import (
     LEAST_LANDMARKS,
     LEAST_MARGIN,
     Hypothesis,
+    away_from,
     hypotheses,
     told_apart,
 )
 from nsm.correspondence.scores import compared
+from nsm.errors import NsmError
 from nsm.stages import counted
 
 _KEPT = 5
@@ -35,7 +39,7 @@ class CollectionProposal:
 
     Attributes:
         vertices: of each hypothesis (L, k) corresponding vertices, best first; the given ones
-            before others.
+            before others. Of the best, if it is sure, ends of limbs of all members, too.
         scores: (H,) mean of the members' scores and of those of the maps between them.
         margin: by how much the total of the scores rises, for each member that changes, if another
             hypothesis of one is taken; or less, if it was less before finer maps were compared.
@@ -83,13 +87,39 @@ def proposed_for_all(
         margin = min(margin, _margin(found_ways))
     best = found_ways[0]
     kept = [best, *_different(found_ways[1:])][:_KEPT]
-    return CollectionProposal(
-        [_landmarks(shapes, hub, {i: found[i][n] for i, n in way.choice.items()}) for way in kept],
-        [way.total / len(others) for way in kept],
-        margin,
-        len(fixed),
-        bool(margin > LEAST_MARGIN and all(found[i][n].good for i, n in best.choice.items())),
-    )
+    vertices = [
+        _landmarks(shapes, hub, {i: found[i][n] for i, n in way.choice.items()}) for way in kept
+    ]
+    taken = [found[i][n] for i, n in best.choice.items()]
+    if len(fixed) >= COMMON:
+        # these tell where the maps go: limbs that are left say nothing against it
+        taken = [replace(h, whole=True) for h in taken]
+    sure = bool(margin > LEAST_MARGIN and all(h.good for h in taken))
+    if sure and len(vertices[0]) >= COMMON:
+        vertices[0] = _completed(meshes, hub, vertices[0], len(fixed))
+    scores = [way.total / len(others) for way in kept]
+    return CollectionProposal(vertices, scores, margin, len(fixed), sure)
+
+
+def _completed(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]], hub: int, rows: np.ndarray, given: int
+) -> np.ndarray:
+    """Landmarks (L, k) with those ends of the hub's limbs that correspond to ends of all others;
+    as they are where one has no finer layout. Given ones, if they are five or more, decide alone.
+    """
+    known = rows[:given] if given >= COMMON else rows
+    others = [i for i in range(len(meshes)) if i != hub]
+    ends: dict[int, dict[int, int]] = {}
+    for i in counted("ends of limbs", others):
+        try:
+            pairs = further_ends((meshes[hub], meshes[i]), known[:, [hub, i]])
+        except NsmError:
+            return rows
+        ends[i] = dict(pairs.tolist())
+    of_all = [v for v in ends[others[0]] if all(v in found for found in ends.values())]
+    more = [[v if i == hub else ends[i][v] for i in range(len(meshes))] for v in of_all]
+    found = np.array(more, dtype=np.int64).reshape(-1, len(meshes))
+    return np.concatenate([known, found, away_from(found, rows[len(known) :], meshes)])
 
 
 def _margin(found: Sequence[Way]) -> float:

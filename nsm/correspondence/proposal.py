@@ -144,13 +144,20 @@ def _completed(best: Hypothesis, given: np.ndarray) -> Hypothesis:
         more = further_ends(meshes, known)
     except NsmError:
         return best
-    tips = best.vertices[len(known) :]
+    tips = away_from(more, best.vertices[len(known) :], meshes)
+    return replace(best, vertices=np.concatenate([known, more, tips]))
+
+
+def away_from(
+    ends: np.ndarray, tips: np.ndarray, meshes: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """Of corresponding tips (T, k), vertices of k meshes, those that are near to no end (L, k)."""
     for k, (vertices, faces) in enumerate(meshes):
-        if len(more) and len(tips):
-            apart = edge_distances(vertices, faces, more[:, k])[:, tips[:, k]].min(axis=0)
+        if len(ends) and len(tips):
+            apart = edge_distances(vertices, faces, ends[:, k])[:, tips[:, k]].min(axis=0)
             area = topology.face_areas(vertices, faces).sum()
             tips = tips[apart > _NEAR * np.sqrt(area)]
-    return replace(best, vertices=np.concatenate([known, more, tips]))
+    return tips
 
 
 def _told_apart(kept: list[Hypothesis]) -> list[Hypothesis]:
