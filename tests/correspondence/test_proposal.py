@@ -310,3 +310,31 @@ def test_near_ties_of_a_collection_are_decided_by_finer_maps(pair, two_maps, mon
     # no finer maps are made where the first is clearly ahead
     tie[1] = replace(first, score=1.5)
     assert proposed_for_all([source, target, target]).sure and len(seen) == 2
+
+
+def test_ends_that_all_members_of_a_collection_have_complete_its_landmarks(
+    pair, two_maps, monkeypatch
+):
+    """Five given landmarks, of which two are no tips: these, and the end that both others have."""
+    source, target, tips = pair
+    numbers = {id(source[0]): 0, id(target[0]): 1}
+    seen = []
+
+    def ends(meshes, known):
+        seen.append((numbers[id(meshes[0][0])], numbers[id(meshes[1][0])], len(known)))
+        both = [(tips[0][3], tips[1][3]), (tips[0][4], tips[1][4])]
+        return np.array(both if len(seen) == 1 else both[1:])
+
+    monkeypatch.setattr(collection_proposal, "further_ends", ends)
+    monkeypatch.setattr(collection_proposal, "hub_of", lambda _: 0)
+    between = np.abs(np.linalg.norm(source[0], axis=1) - 1).argsort()[[0, 40]]
+    images = np.abs(np.linalg.norm((target[0] - [5, 6, 7]) / 40, axis=1) - 1).argsort()[[0, 40]]
+    ours, theirs = (np.append(t[:3], b) for t, b in zip(tips, (between, images), strict=True))
+    given = np.stack([ours, theirs, theirs], axis=1)
+    rows = np.concatenate([given[:, :2], np.stack([tips[0][4:], tips[1][4:]], axis=1)])
+    right = replace(two_maps[0], vertices=rows, score=1.0, whole=False)
+    monkeypatch.setattr(collection_proposal, "hypotheses", lambda *_: [right])
+    found = proposed_for_all([source, target, target], given)
+    assert found.sure and seen == [(0, 1, 5), (0, 1, 5)]
+    assert found.vertices[0][:5].tolist() == given.tolist()
+    assert found.vertices[0][5:].tolist() == [[tips[0][4], tips[1][4], tips[1][4]]]
