@@ -228,7 +228,10 @@ class QuasiNewton(Optimizer):
             k = place[id(field)]
             more = self._moving[k][1].matrices(x, blocks)
             matrices[k] = [a + b for a, b in zip(matrices[k], more, strict=True)]
-        metrics = [Metric(each) for each in matrices]
+        metrics = [
+            Metric(each, level.order)
+            for each, (_, level) in zip(matrices, self._moving, strict=True)
+        ]
 
         def solve(g: np.ndarray) -> np.ndarray:
             parts = zip(metrics, self._split(g), strict=True)

@@ -11,6 +11,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from nsm.maps import SplineField
+from nsm.tasks.dissection import nested_dissection
 from nsm.tasks.multigrid import refinement_along
 
 # of H¹ beside the curvature of the loss: it decides where no point sees a coefficient
@@ -53,11 +54,23 @@ class Level:
         inner, smooth = _forms(self.grid.side, cells, field.periodic)
         self.floor = (_FLOOR * (whole.T @ inner @ whole)).tocsc()
         self.smoothness = (whole.T @ smooth @ whole).tocsc()
+        self._order: np.ndarray | None = None
 
     @property
     def rows(self) -> int:
         """Coefficients of each component."""
         return int(self.up.shape[1])
+
+    @property
+    def order(self) -> np.ndarray:
+        """An order of the rows in which factors of their matrices fill in little."""
+        if self._order is None:
+            row, column = np.divmod(np.arange(self.rows), self.grid.side)
+            if self.grid.odd:  # the pillow's two sides lie on each other: neighbours are near
+                column = np.minimum(column, self.grid.side - 1 - column)
+            place = np.stack([row, column], axis=1)
+            self._order = nested_dissection(self.smoothness.tocsr(), place)
+        return self._order
 
     def restored(self, fine: np.ndarray) -> np.ndarray:
         """The level's coefficients (rows, d) of a spline of the level, given on the fine grid."""
@@ -101,14 +114,16 @@ class Metric:
 
     Args:
         matrices: one (rows, rows) for each component.
+        order: (rows,) in which they are factorised.
     """
 
-    def __init__(self, matrices: Sequence[csc_matrix]) -> None:
-        # symmetric and positive: no pivoting, and an ordering that knows it
+    def __init__(self, matrices: Sequence[csc_matrix], order: np.ndarray) -> None:
+        self.order = order
+        # symmetric and positive: no pivoting
         self.factors = [
             splu(
-                matrix.tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
+                matrix[order][:, order].tocsc(),
+                permc_spec="NATURAL",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
             )
@@ -117,8 +132,10 @@ class Metric:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """The matrices' inverses times the columns of (rows, d)."""
-        columns = [f.solve(right[:, k].copy()) for k, f in enumerate(self.factors)]
-        return np.stack(columns, axis=1)
+        result = np.empty_like(right)
+        for k, factor in enumerate(self.factors):
+            result[self.order, k] = factor.solve(right[self.order, k])
+        return result
 
 
 def _whole(grid: SplineField) -> csr_matrix:

@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from scipy.sparse.linalg import splu
 
 from nsm.errors import NsmError
 from nsm.maps import DiscMap, LatticeAligned, NeuralMap, PlanarMap, SplineField, TorusMap
@@ -84,9 +85,21 @@ def test_a_metric_solves_each_component():
     level = Level(SplineField(1, 6), 6)
     matrices = [level.floor, level.floor + level.smoothness]
     right = np.random.default_rng(0).standard_normal((level.rows, 2))
-    solved = Metric(matrices).solve(right)
+    solved = Metric(matrices, level.order).solve(right)
     for k, matrix in enumerate(matrices):
         np.testing.assert_allclose(matrix @ solved[:, k], right[:, k], atol=1e-8)
+
+
+@pytest.mark.parametrize("odd", [False, True])
+def test_factors_in_a_levels_order_are_smaller_than_by_minimum_degree(odd):
+    level = Level(SplineField(1, 64, periodic=odd, odd=odd), 64)
+    x = 2 * torch.rand(20_000, 2, dtype=torch.float64) - 1
+    seen = level.matrices(x, torch.eye(3, dtype=torch.float64).expand(1, len(x), 3, 3))
+    matrix = (level.floor + level.smoothness + seen[0]).tocsc()
+    assert np.array_equal(np.sort(level.order), np.arange(level.rows))
+    options = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    least = splu(matrix, permc_spec="MMD_AT_PLUS_A", **options).L.nnz
+    assert Metric([matrix], level.order).factors[0].L.nnz < least
 
 
 def test_an_odd_spline_is_odd_and_periodic():
