@@ -182,12 +182,12 @@ def test_groups_can_be_changed_separately():
 @pytest.mark.parametrize(
     ("overrides", "linear_skip", "steps"),
     [
-        ([], "fitted", 250),
-        (["map=residual"], "fitted", 250),
+        ([], "fitted", 100),
+        (["map=residual"], "fitted", 100),
         (["initialization=random"], "none", 8000),
         (["encoding=fourier"], "none", 8000),
         (["encoding=identity"], "none", 8000),
-        (["encoding=fourier", "initialization=fitted"], "fitted", 250),
+        (["encoding=fourier", "initialization=fitted"], "fitted", 100),
         (["experiment=fit"], "fitted", 0),
         (["experiment=paper"], "none", 50_000),
         (["sweep=activation"], "none", 8000),

@@ -45,7 +45,7 @@ def test_the_values_are_those_of_the_run():
 @pytest.mark.parametrize(
     ("arguments", "steps"),
     [
-        ([], 250),
+        ([], 100),
         (["task=param"], 8),
         (["initialization=random"], 8000),
         (["trainer.max_steps=7"], 7),

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 _GRIDS = ("nsm.maps.encodings.SplineGrid", "nsm.maps.SplineGrid")
+# cells of a surface over those on the disc, whose cut reaches all tips: a limb without a cone is
+# squeezed more
+_MORE = 1.25
 
 
 class ClosedDomain(Domain):
@@ -196,8 +199,8 @@ class ClosedDomain(Domain):
     ) -> dict[str, Any]:
         """Settings of the spline grid with Ω's symmetries that stands for one on the plane.
 
-        It has r² cells on Ω, as many as a grid of the same ``resolutions``; cells are nearly square
-        in the plane of the surface's lattice.
+        For a map it has r² cells on Ω, as many as a grid of the same ``resolutions``, for a surface
+        a quarter more; cells are nearly square in the plane of the surface's lattice.
 
         Args:
             settings: of :class:`nsm.maps.SplineGrid`, or of such a grid already.
@@ -222,7 +225,7 @@ class ClosedDomain(Domain):
         aspect = float(np.sqrt(long / short))
         levels = []
         for resolution in settings.get("resolutions", (8, 16, 32, 64, 128)):
-            side = resolution * math.sqrt(copies)
+            side = resolution * math.sqrt(copies if of_map else _MORE * copies)
             # a power of two in each number of cells, for multigrid
             step = max(4, 2 ** int(math.log2(max(resolution, 16) / 16)))
             levels.append([max(1, round(side * f / step)) * step for f in (aspect, 1 / aspect)])
