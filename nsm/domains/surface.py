@@ -18,6 +18,7 @@ from nsm.domains.base import Domain, Keys
 from nsm.domains.caps import without_caps
 from nsm.domains.embedding import GIVEN
 from nsm.domains.laid_out import closed_laid_out, cut_laid_out
+from nsm.domains.layout import Layout
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
 from nsm.domains.preparation import Preparation, vertex_numbers
@@ -26,6 +27,7 @@ from nsm.surfaces import cache as cache_
 from nsm.surfaces import holes, topology
 from nsm.surfaces.cutting import Cut, chords_joined, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
+from nsm.surfaces.location import Locator
 from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs
 
@@ -361,7 +363,18 @@ class Surface:
 
     def at(self, uv: np.ndarray) -> np.ndarray:
         """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
-        return self.domain.locate(uv, self.uv, self.faces).take(self.vertices, self.faces)
+        return self.layout.locate(uv).take(self.vertices, self.faces)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The mesh over Ω, on which points of Ω are looked up."""
+        return self.domain.layout(self.uv, self.faces)
+
+    @cached_property
+    def locator(self) -> Locator:
+        """The mesh in space without caps, on which points near it are looked up."""
+        faces = self.faces if self.caps is None else self.faces[~self.caps]
+        return Locator(self.vertices, faces)
 
     @property
     def bounding_box_diagonal(self) -> float:

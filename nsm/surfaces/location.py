@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import NamedTuple
+from weakref import finalize
 
 import numpy as np
 
@@ -35,6 +36,39 @@ class Places(NamedTuple):
         return Places(face, weights)
 
 
+class Locator:
+    """A mesh, in the plane or in space, on which the nearest points to given ones are looked up.
+
+    libigl's tree of its triangles is built once and serves all calls.
+
+    Args:
+        vertices: (V, d), d = 2 or 3.
+        faces: (F, 3).
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        import igl
+
+        self._vertices = _spatial(vertices)
+        self._faces = np.ascontiguousarray(faces, dtype=np.int64)
+        tree = igl.AABB()
+        tree.init(self._vertices, self._faces)
+        self._tree = [tree]
+        # also when Python ends: libigl's binding warns of trees that are alive then
+        finalize(self, self._tree.clear)
+
+    def __reduce__(self) -> tuple[type[Locator], tuple[np.ndarray, np.ndarray]]:
+        return Locator, (self._vertices, self._faces)  # libigl's tree cannot be copied
+
+    def locate(self, points: np.ndarray) -> Places:
+        """The nearest points on the mesh to points (N, d)."""
+        near = _pulled_near(_spatial(points), self._vertices)
+        _, face, nearest = self._tree[0].squared_distance(self._vertices, self._faces, near)
+        face = np.asarray(face, dtype=np.int64).reshape(-1)
+        corners = self._vertices[self._faces[face]]
+        return Places(face, _barycentric(np.asarray(nearest), corners))
+
+
 def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Places:
     """The nearest point on a mesh to each given point, in the plane or in space.
 
@@ -43,18 +77,13 @@ def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Place
         vertices: (V, d).
         faces: (F, 3).
     """
-    import igl
+    return Locator(vertices, faces).locate(points)
 
-    def spatial(p: np.ndarray) -> np.ndarray:
-        p = np.asarray(p, dtype=np.float64)
-        return np.ascontiguousarray(np.pad(p, ((0, 0), (0, 3 - p.shape[1]))))
 
-    mesh = spatial(vertices)
-    near = _pulled_near(spatial(points), mesh)
-    _, face, nearest = igl.point_mesh_squared_distance(near, mesh, faces)
-    face = np.asarray(face, dtype=np.int64).reshape(-1)
-    corners = mesh[faces[face]]
-    return Places(face, _barycentric(np.asarray(nearest), corners))
+def _spatial(points: np.ndarray) -> np.ndarray:
+    """Points (N, d) as points (N, 3), d = 2 or 3."""
+    p = np.asarray(points, dtype=np.float64)
+    return np.ascontiguousarray(np.pad(p, ((0, 0), (0, 3 - p.shape[1]))))
 
 
 def _pulled_near(points: np.ndarray, mesh: np.ndarray) -> np.ndarray:
