@@ -51,6 +51,9 @@ class Locator:
 
         self._vertices = _spatial(vertices)
         self._faces = np.ascontiguousarray(faces, dtype=np.int64)
+        low, high = self._vertices.min(axis=0), self._vertices.max(axis=0)
+        self._centre = 0.5 * (low + high)
+        self._limit = _FAR * max(float((high - low).max()), 1e-300)
         tree = igl.AABB()
         tree.init(self._vertices, self._faces)
         self._tree = [tree]
@@ -62,11 +65,26 @@ class Locator:
 
     def locate(self, points: np.ndarray) -> Places:
         """The nearest points on the mesh to points (N, d)."""
-        near = _pulled_near(_spatial(points), self._vertices)
+        near = self._pulled_near(_spatial(points))
         _, face, nearest = self._tree[0].squared_distance(self._vertices, self._faces, near)
         face = np.asarray(face, dtype=np.int64).reshape(-1)
         corners = self._vertices[self._faces[face]]
         return Places(face, _barycentric(np.asarray(nearest), corners))
+
+    def _pulled_near(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3), with those very far from the mesh moved straight towards its centre.
+
+        Their nearest points do not change. Without it, squared distances would be equal or infinite
+        after rounding, and libigl would return a face that does not exist.
+        """
+        offset = points.clip(-_LARGEST, _LARGEST) - self._centre
+        reach = np.abs(offset).max(axis=1, keepdims=True, initial=0.0)
+        far = reach[:, 0] > self._limit
+        if not far.any():
+            return points
+        result = points.copy()
+        result[far] = self._centre + offset[far] * (self._limit / reach[far])
+        return result
 
 
 def locate(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Places:
@@ -84,22 +102,6 @@ def _spatial(points: np.ndarray) -> np.ndarray:
     """Points (N, d) as points (N, 3), d = 2 or 3."""
     p = np.asarray(points, dtype=np.float64)
     return np.ascontiguousarray(np.pad(p, ((0, 0), (0, 3 - p.shape[1]))))
-
-
-def _pulled_near(points: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-    """Points (N, 3), with those very far from a mesh (V, 3) moved straight towards its centre.
-
-    Their nearest points do not change. Without it, squared distances would be equal or infinite
-    after rounding, and libigl would return a face that does not exist.
-    """
-    low, high = mesh.min(axis=0), mesh.max(axis=0)
-    offset = points.clip(-_LARGEST, _LARGEST) - 0.5 * (low + high)
-    limit = _FAR * max(float((high - low).max()), 1e-300)
-    reach = np.abs(offset).max(axis=1, keepdims=True)
-    far = reach[:, 0] > limit
-    result = points.copy()
-    result[far] = 0.5 * (low + high) + offset[far] * (limit / reach[far])
-    return result
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -74,14 +74,18 @@ def triangles_over_domain(
     _, home = group.into_domain(corners.mean(axis=1) / SIDE, symmetric)
     corners = SIDE * group.moved(home[:, None], corners / SIDE)
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
+    lowest, highest = (
+        function(function(corners[:, 0], corners[:, 1]), corners[:, 2])
+        for function in (np.minimum, np.maximum)
+    )
     parts, numbers, elements = [], [], []
     for sign in (1, -1) if symmetric else (1,):
-        least, most = (sign * corners).min(axis=1), (sign * corners).max(axis=1)
+        least, most = (lowest, highest) if sign > 0 else (-highest, -lowest)
         first = np.ceil((low - most.max(axis=0)) / SIDE).astype(int)
         last = np.floor((1.0 - least.min(axis=0)) / SIDE).astype(int)
         for shift in product(*(range(a, b + 1) for a, b in zip(first, last, strict=True))):
             by = SIDE * np.array(shift)
-            meets = (most + by >= low).all(axis=1) & (least + by <= 1.0).all(axis=1)
+            meets = np.logical_and(*((most + by >= low) & (least + by <= 1.0)).T)
             parts.append(sign * corners[meets] + by)
             numbers.append(np.flatnonzero(meets))
             elements.append(group.compose(np.array([sign, *shift]), home[meets]))
