@@ -39,8 +39,9 @@ def inverted(
     """
     x = start.clone()
     moving = torch.arange(len(x), device=x.device)
+    evaluated = cast(PointMap, h).value_and_jacobian
+    value, jacobian = (part.clone() for part in evaluated(x))
     for _ in range(_STEPS):
-        value, jacobian = cast(PointMap, h).value_and_jacobian(x[moving])
         off = targets[moving] - value
         distance = off.norm(dim=1)
         safe = torch.linalg.det(jacobian).abs() > 1e-12
@@ -55,12 +56,16 @@ def inverted(
             trial = x[index] + step[left]
             if project is not None:
                 trial = project(trial)
-            now = (targets[index] - h(trial)).norm(dim=1) < (1 - _NEARER) * distance[left]
+            # most steps are taken: the Jacobian is for the next one
+            there, slope = evaluated(trial)
+            now = (targets[index] - there).norm(dim=1) < (1 - _NEARER) * distance[left]
             x[index[now]] = trial[now]
+            value[left[now]], jacobian[left[now]] = there[now], slope[now]
             moved[left[now]] = True
             left = left[~now]
             step[left] *= _SHRINK
-        moving = moving[moved]  # the others would only try the same steps again
+        # the others would only try the same steps again
+        moving, value, jacobian = (part[moved] for part in (moving, value, jacobian))
         if len(moving) == 0:
             break
     return x
@@ -84,17 +89,20 @@ def preimages(
     """
     if project is not None:
         targets = project(targets)
-    images = h(nodes)
-    tree = cKDTree(images.cpu().numpy())
-    _, near = tree.query(targets.cpu().numpy(), k=[*range(1, min(_STARTS, len(images)) + 1)])
-    starts = nodes[torch.as_tensor(near, device=nodes.device)]
-    result = inverted(h, targets, starts[:, 0], project)
+    tree = cKDTree(h(nodes).cpu().numpy())
+
+    def start(targets: Tensor, k: int) -> Tensor:
+        """The nodes with the k-th nearest images."""
+        near = tree.query(targets.cpu().numpy(), k=[k])[1][:, 0]
+        return nodes[torch.as_tensor(near, device=nodes.device)]
+
+    result = inverted(h, targets, start(targets, 1), project)
     off = (h(result) - targets).norm(dim=1)
-    for k in range(1, starts.shape[1]):
+    for k in range(2, min(_STARTS, len(nodes)) + 1):
         missed = (off > _ENOUGH).nonzero()[:, 0]
         if len(missed) == 0:
             break
-        other = inverted(h, targets[missed], starts[missed, k], project)
+        other = inverted(h, targets[missed], start(targets[missed], k), project)
         distance = (h(other) - targets[missed]).norm(dim=1)
         better = distance < off[missed]
         result[missed[better]], off[missed[better]] = other[better], distance[better]

@@ -6,7 +6,7 @@ import copy
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -255,32 +255,58 @@ def collection_metrics(
     figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
     cycles = list(itertools.permutations(range(len(collection)), 3))
     cycles = cycles[:: -(-len(cycles) // _MOST_CYCLES)]
-    for name, error in (("", _cycle_error), ("_networks", _networks_cycle_error)):
-        errors = [error(collection, *cycle) for cycle in counted("cycles measured", cycles)]
+    for name, followed in (("", _Followed), ("_networks", _FollowedByNetworks)):
+        paths = followed(collection)
+        errors = [paths.error(*cycle) for cycle in counted("cycles measured", cycles)]
         figures[f"cycle_error{name}_mean_percent"] = float(np.mean([e.mean() for e in errors]))
         figures[f"cycle_error{name}_max_percent"] = float(max(e.max() for e in errors))
     return figures
 
 
-def _cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
-    """Distances (V,) of vertices of i from their images by i→j→k→i, in percent of the diagonal."""
-    surface = collection.surfaces[i]
-    start = surface.in_original_units(surface.surface.vertices[::_CYCLE_EVERY])
-    points = start
-    for a, b in ((i, j), (j, k), (k, i)):
-        points = collection.pair(a, b)(points)
-    diagonal = surface.surface.bounding_box_diagonal / surface.surface.scale
-    return 100 * np.linalg.norm(points - start, axis=1) / diagonal
+class _Followed:
+    """Vertices of the surfaces, followed from one to the next."""
+
+    def __init__(self, collection: SurfaceCollection) -> None:
+        self.collection = collection
+        self.after = cache(self._after)  # cycles begin alike
+
+    def error(self, i: int, j: int, k: int) -> np.ndarray:
+        """Distances (V,) of vertices of i from their images by i→j→k→i, in percent of the
+        diagonal."""
+        surface = self.collection.surfaces[i].surface
+        return self._off(self.after(i, j, k, i), i) * 100 / surface.bounding_box_diagonal
+
+    def _after(self, *path: int) -> np.ndarray:
+        """Where vertices of the first surface of a path are on the last one, (V, 3)."""
+        *before, last = path
+        if not before:
+            surface = self.collection.surfaces[last]
+            return surface.in_original_units(surface.surface.vertices[::_CYCLE_EVERY])
+        return self.collection.pair(before[-1], last)(self.after(*before))
+
+    def _off(self, points: np.ndarray, i: int) -> np.ndarray:
+        """How far points (V, 3) of a surface are from its vertices, in normalised units."""
+        scale = self.collection.surfaces[i].surface.scale
+        return np.asarray(np.linalg.norm(points - self.after(i), axis=1) * scale)
 
 
-def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
-    """As :func:`_cycle_error`, by the networks alone, from domain to domain."""
-    surface = collection.surfaces[i].surface
-    uv = surface.uv[::_CYCLE_EVERY]
-    for a, b in ((i, j), (j, k), (k, i)):
-        uv = surface.domain.canonical(evaluate(collection.pair(a, b).map, uv))
-    off = np.linalg.norm(surface.at(uv) - surface.vertices[::_CYCLE_EVERY], axis=1)
-    return 100 * off / surface.bounding_box_diagonal
+class _FollowedByNetworks(_Followed):
+    """The same by the networks alone, from domain to domain."""
+
+    def _after(self, *path: int) -> np.ndarray:
+        """As points (V, 2) of the last surface's domain."""
+        *before, last = path
+        surface = self.collection.surfaces[last].surface
+        if not before:
+            return surface.uv[::_CYCLE_EVERY]
+        h = self.collection.pair(before[-1], last).map
+        return surface.domain.canonical(evaluate(h, self.after(*before)))
+
+    def _off(self, points: np.ndarray, i: int) -> np.ndarray:
+        surface = self.collection.surfaces[i].surface
+        return np.asarray(
+            np.linalg.norm(surface.at(points) - surface.vertices[::_CYCLE_EVERY], axis=1)
+        )
 
 
 def _common(landmarks: np.ndarray) -> np.ndarray:
