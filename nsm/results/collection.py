@@ -123,9 +123,7 @@ class SurfaceCollection:
         first, second = (_double(self.maps[n]) for n in (source, target))
         s = self.surfaces[source].surface
         h = TransitionMap(first, second, self._nodes(source), self._project).eval()
-        if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
-            uv = torch.as_tensor(s.uv)
-            self._back[source] = torch.cat([h.back(part) for part in uv.split(_CHUNK)]).numpy()
+        image = evaluate(h.second, self._preimages(source))
         return SurfaceMap(
             self.surfaces[source],
             self.surfaces[target],
@@ -134,8 +132,17 @@ class SurfaceCollection:
             {},
             self.config,
             self.corrections.get((source, target), Correction()),
-            s.domain.copied(s.uv, s.seam_pairs, evaluate(h.second, self._back[source])),
+            s.domain.copied(s.uv, s.seam_pairs, image),
         )
+
+    def _preimages(self, source: int) -> np.ndarray:
+        """h_i⁻¹ at the vertices of a surface: (V, 2) in the common domain."""
+        if source not in self._back:  # it takes longest, and all maps of a source share it
+            h, nodes = _double(self.maps[source]), self._nodes(source)
+            uv = torch.as_tensor(self.surfaces[source].surface.uv).split(_CHUNK)
+            found = torch.cat([preimages(h, part, nodes, self._project) for part in uv])
+            self._back[source] = found.numpy()
+        return self._back[source]
 
     @property
     def _project(self) -> Callable[[Tensor], Tensor] | None:
@@ -299,6 +306,9 @@ class _FollowedByNetworks(_Followed):
         surface = self.collection.surfaces[last].surface
         if not before:
             return surface.uv[::_CYCLE_EVERY]
+        if len(before) == 1:  # from vertices, whose preimages are known
+            h, start = _double(self.collection.maps[last]), self.collection._preimages(before[0])
+            return surface.domain.canonical(evaluate(h, start[::_CYCLE_EVERY]))
         h = self.collection.pair(before[-1], last).map
         return surface.domain.canonical(evaluate(h, self.after(*before)))
 

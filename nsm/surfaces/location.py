@@ -10,6 +10,7 @@ import numpy as np
 
 _FAR = 1e6  # in sizes of the mesh
 _LARGEST = 1e300
+_CELLS = 32  # along each axis
 
 
 class Places(NamedTuple):
@@ -53,7 +54,7 @@ class Locator:
         self._faces = np.ascontiguousarray(faces, dtype=np.int64)
         low, high = self._vertices.min(axis=0), self._vertices.max(axis=0)
         self._centre = 0.5 * (low + high)
-        self._limit = _FAR * max(float((high - low).max()), 1e-300)
+        self._size = max(float((high - low).max()), 1e-300)
         tree = igl.AABB()
         tree.init(self._vertices, self._faces)
         self._tree = [tree]
@@ -66,10 +67,20 @@ class Locator:
     def locate(self, points: np.ndarray) -> Places:
         """The nearest points on the mesh to points (N, d)."""
         near = self._pulled_near(_spatial(points))
-        _, face, nearest = self._tree[0].squared_distance(self._vertices, self._faces, near)
-        face = np.asarray(face, dtype=np.int64).reshape(-1)
-        corners = self._vertices[self._faces[face]]
-        return Places(face, _barycentric(np.asarray(nearest), corners))
+        order = self._by_cells(near)
+        _, found, nearest = self._tree[0].squared_distance(self._vertices, self._faces, near[order])
+        found = np.asarray(found, dtype=np.int64).reshape(-1)
+        face, weights = np.empty(len(near), dtype=np.int64), np.empty((len(near), 3))
+        face[order] = found
+        weights[order] = _barycentric(np.asarray(nearest), self._vertices[self._faces[found]])
+        return Places(face, weights)
+
+    def _by_cells(self, points: np.ndarray) -> np.ndarray:
+        """An order (N,) in which points (N, 3) of one cell of a grid follow each other: the parts
+        of the tree that they visit are then in the processor's cache."""
+        number = (points - self._centre) * (_CELLS / self._size) + 0.5 * _CELLS
+        i, j, k = number.astype(np.int64).clip(0, _CELLS - 1).T
+        return np.argsort((i * _CELLS + j) * _CELLS + k)
 
     def _pulled_near(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3), with those very far from the mesh moved straight towards its centre.
@@ -79,11 +90,12 @@ class Locator:
         """
         offset = points.clip(-_LARGEST, _LARGEST) - self._centre
         reach = np.abs(offset).max(axis=1, keepdims=True, initial=0.0)
-        far = reach[:, 0] > self._limit
+        limit = _FAR * self._size
+        far = reach[:, 0] > limit
         if not far.any():
             return points
         result = points.copy()
-        result[far] = self._centre + offset[far] * (self._limit / reach[far])
+        result[far] = self._centre + offset[far] * (limit / reach[far])
         return result
 
 
@@ -108,8 +120,8 @@ def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Barycentric coordinates (N, 3) of points (N, 3) in triangles (N, 3, 3), clipped to them."""
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = points - corners[:, 0]
-    d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
-    p1, p2 = (p * e1).sum(1), (p * e2).sum(1)
+    products = (e1, e1), (e1, e2), (e2, e2), (p, e1), (p, e2)
+    d11, d12, d22, p1, p2 = (np.einsum("nk,nk->n", *two) for two in products)
     determinant = d11 * d22 - d12 * d12
     solvable = determinant > 1e-30 * np.maximum(d11 * d22, 1e-300)
     safe = np.where(solvable, determinant, 1.0)
