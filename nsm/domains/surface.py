@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -33,6 +33,9 @@ from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 OPTIONAL = ("lattice", "ends", "caps", "given_uv")
+_LARGE = 200_000  # faces
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +90,7 @@ class Surface:
     caps: np.ndarray | None = field(default=None, repr=False)
     given_uv: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
+    _made: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def load(
@@ -365,16 +369,26 @@ class Surface:
         """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
         return self.layout.locate(uv).take(self.vertices, self.faces)
 
-    @cached_property
+    @property
     def layout(self) -> Layout:
         """The mesh over Ω, on which points of Ω are looked up."""
-        return self.domain.layout(self.uv, self.faces)
+        return self._kept("layout", lambda: self.domain.layout(self.uv, self.faces))
 
-    @cached_property
+    @property
     def locator(self) -> Locator:
         """The mesh in space without caps, on which points near it are looked up."""
         faces = self.faces if self.caps is None else self.faces[~self.caps]
-        return Locator(self.vertices, faces)
+        return self._kept("locator", lambda: Locator(self.vertices, faces))
+
+    def _kept(self, name: str, make: Callable[[], T]) -> T:
+        """What ``make()`` makes of the mesh, for the next call too; of a large mesh for one call,
+        as it takes more memory than the mesh."""
+        if len(self.faces) > _LARGE:
+            return make()
+        if name not in self._made:
+            self._made[name] = make()
+        made: T = self._made[name]
+        return made
 
     @property
     def bounding_box_diagonal(self) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
 from nsm.maps import PlanarMap, TransitionMap
-from nsm.maps.inverse import preimages
+from nsm.maps.inverse import Inverse
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, combined
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
@@ -54,6 +54,7 @@ class SurfaceCollection:
     config: dict[str, Any] = field(default_factory=dict, repr=False)
     corrections: dict[tuple[int, int], Correction] = field(default_factory=dict, repr=False)
     _made: dict[tuple[int, int], SurfaceMap] = field(default_factory=dict, repr=False)
+    _inverses: dict[int, Inverse] = field(default_factory=dict, repr=False)
     _back: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
     _marked: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
@@ -138,11 +139,16 @@ class SurfaceCollection:
     def _preimages(self, source: int) -> np.ndarray:
         """h_i⁻¹ at the vertices of a surface: (V, 2) in the common domain."""
         if source not in self._back:  # it takes longest, and all maps of a source share it
-            h, nodes = _double(self.maps[source]), self._nodes(source)
-            uv = torch.as_tensor(self.surfaces[source].surface.uv).split(_CHUNK)
-            found = torch.cat([preimages(h, part, nodes, self._project) for part in uv])
-            self._back[source] = found.numpy()
+            self._back[source] = self._pulled_back(source, self.surfaces[source].surface.uv)
         return self._back[source]
+
+    def _pulled_back(self, source: int, uv: np.ndarray) -> np.ndarray:
+        """h_i⁻¹ at points (N, 2) of a surface's domain: (N, 2) in the common domain."""
+        if source not in self._inverses:
+            h, nodes = _double(self.maps[source]), self._nodes(source)
+            self._inverses[source] = Inverse(h, nodes, self._project)
+        parts = torch.as_tensor(uv).split(_CHUNK)
+        return torch.cat([self._inverses[source](part) for part in parts]).numpy()
 
     @property
     def _project(self) -> Callable[[Tensor], Tensor] | None:
@@ -174,7 +180,7 @@ class SurfaceCollection:
             s, h = self.surfaces[number].surface, _double(self.maps[number])
             uv, ids = torch.as_tensor(s.uv), self.landmarks[:, number]
             targets = uv[s.cut_vertex[ids[ids >= 0]]]
-            found = preimages(h, targets, h.back(uv), self._project)  # type: ignore[operator]
+            found = Inverse(h, h.back(uv), self._project)(targets)  # type: ignore[operator]
             places = found.new_full((len(ids), 2), torch.nan)
             places[torch.as_tensor(ids >= 0)] = found
             self._marked[number] = places
@@ -300,17 +306,24 @@ class _Followed:
 class _FollowedByNetworks(_Followed):
     """The same by the networks alone, from domain to domain."""
 
+    def __init__(self, collection: SurfaceCollection) -> None:
+        super().__init__(collection)
+        self.common = cache(self._common)
+
     def _after(self, *path: int) -> np.ndarray:
         """As points (V, 2) of the last surface's domain."""
         *before, last = path
         surface = self.collection.surfaces[last].surface
         if not before:
             return surface.uv[::_CYCLE_EVERY]
-        if len(before) == 1:  # from vertices, whose preimages are known
-            h, start = _double(self.collection.maps[last]), self.collection._preimages(before[0])
-            return surface.domain.canonical(evaluate(h, start[::_CYCLE_EVERY]))
-        h = self.collection.pair(before[-1], last).map
-        return surface.domain.canonical(evaluate(h, self.after(*before)))
+        image = evaluate(_double(self.collection.maps[last]), self.common(*before))
+        return surface.domain.canonical(image)
+
+    def _common(self, *path: int) -> np.ndarray:
+        """As points (V, 2) of the common domain."""
+        if len(path) == 1:
+            return self.collection._preimages(path[0])[::_CYCLE_EVERY]
+        return self.collection._pulled_back(path[-1], self.after(*path))
 
     def _off(self, points: np.ndarray, i: int) -> np.ndarray:
         surface = self.collection.surfaces[i].surface

@@ -235,9 +235,10 @@ class SurfaceMap:
         """Images (V, 2) of the source's vertices in the target's domain, with the correction."""
         return self.correction.of(self._uncorrected)
 
-    @cached_property
+    @property
     def image_layout(self) -> Layout:
-        """The source's mesh as the map lays it out over the target's domain."""
+        """The source's mesh as the map lays it out over the target's domain. It is not kept: a
+        collection has many maps."""
         s = self.source.surface
         return s.domain.layout(self.image_uv, s.faces)
 
