@@ -120,8 +120,8 @@ def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Barycentric coordinates (N, 3) of points (N, 3) in triangles (N, 3, 3), clipped to them."""
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = points - corners[:, 0]
-    products = (e1, e1), (e1, e2), (e2, e2), (p, e1), (p, e2)
-    d11, d12, d22, p1, p2 = (np.einsum("nk,nk->n", *two) for two in products)
+    d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
+    p1, p2 = (p * e1).sum(1), (p * e2).sum(1)
     determinant = d11 * d22 - d12 * d12
     solvable = determinant > 1e-30 * np.maximum(d11 * d22, 1e-300)
     safe = np.where(solvable, determinant, 1.0)
