@@ -6,6 +6,7 @@ Disc and square have a boundary; orbifold and torus are closed.
 from nsm.domains.automatic import Automatic
 from nsm.domains.base import BoundedDomain, Domain, Keys
 from nsm.domains.disc import Disc
+from nsm.domains.layout import Layout
 from nsm.domains.names import DOMAINS, bounded, domain, from_stored, stored
 from nsm.domains.orbifold.domain import Orbifold, Torus
 from nsm.domains.square import Square
@@ -18,6 +19,7 @@ __all__ = [
     "Disc",
     "Domain",
     "Keys",
+    "Layout",
     "Orbifold",
     "Square",
     "Surface",

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from nsm.domains import embedding, planar_mesh, untangling
+from nsm.domains.layout import Layout
 from nsm.domains.reinsertion import turned_back
-from nsm.surfaces.location import Places, locate
+from nsm.surfaces.location import Places
 from nsm.surfaces.topology import boundary_loops
 
 if TYPE_CHECKING:
@@ -128,32 +129,17 @@ class Domain(ABC):
         domain; arguments as for :meth:`repaired`."""
         return image
 
-    def carried(
-        self,
-        points: np.ndarray,
-        before: np.ndarray,
-        after: np.ndarray,
-        faces: np.ndarray,
-        copies: np.ndarray,
-    ) -> np.ndarray:
-        """Images (N, 2) of points (N, 2) under the map that is linear on the triangles.
-
-        Args:
-            points: of Ω; on a closed domain in any lift, and the images are in the lift that the
-                map sends them to.
-            before, after: (V, 2) the vertices of a mesh over Ω, and their images.
-            faces: (F, 3).
-            copies: as for :meth:`certificate`.
-        """
-        return locate(points, before, faces).take(after, faces)
-
     @abstractmethod
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Mask (...) of the points (..., 2) that a picture of Ω shows."""
 
+    def layout(self, uv: np.ndarray, faces: np.ndarray) -> Layout:
+        """A mesh laid out over Ω, uv (V, 2), faces (F, 3), on which points are looked up."""
+        return Layout(uv, faces)
+
     def locate(self, points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Places:
-        """The places of points (N, 2) of Ω on a mesh laid out over it, uv (V, 2), faces (F, 3)."""
-        return locate(points, uv, faces)
+        """The places of points (N, 2) of Ω on such a mesh; for one call only."""
+        return self.layout(uv, faces).locate(points)
 
     def canonical(self, points: np.ndarray) -> np.ndarray:
         """Of the lifts of points (N, 2), those (N, 2) in the fundamental domain of a closed Ω."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nsm.surfaces.location import Places, locate
+from nsm.surfaces.location import Places
 
 if TYPE_CHECKING:
     from nsm.domains.surface import Surface
@@ -44,11 +44,10 @@ def on_caps(surface: Surface, face: np.ndarray) -> np.ndarray:
 
 def located_on_part(surface: Surface, points: np.ndarray) -> Places:
     """The nearest places to points (N, 3), in normalised units, on a surface without its caps."""
+    near = surface.locator.locate(points)
     if surface.caps is None:
-        return locate(points, surface.vertices, surface.faces)
-    own = np.flatnonzero(~surface.caps)
-    near = locate(points, surface.vertices, surface.faces[own])
-    return Places(own[near.face], near.weights)
+        return near
+    return Places(np.flatnonzero(~surface.caps)[near.face], near.weights)
 
 
 def off_rims(surface: Surface, places: Places) -> Places:

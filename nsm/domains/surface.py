@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -18,6 +18,7 @@ from nsm.domains.base import Domain, Keys
 from nsm.domains.caps import without_caps
 from nsm.domains.embedding import GIVEN
 from nsm.domains.laid_out import closed_laid_out, cut_laid_out
+from nsm.domains.layout import Layout
 from nsm.domains.names import domain as domain_of
 from nsm.domains.names import stored as stored_domain
 from nsm.domains.preparation import Preparation, vertex_numbers
@@ -26,11 +27,15 @@ from nsm.surfaces import cache as cache_
 from nsm.surfaces import holes, topology
 from nsm.surfaces.cutting import Cut, chords_joined, first_copies, seam_pairs
 from nsm.surfaces.given import given_mesh
+from nsm.surfaces.location import Locator
 from nsm.surfaces.textures import read_uv
 from nsm.surfaces.validation import NO_DECISION, CleanMesh, Repairs
 
 ARRAYS = ("vertices", "faces", "uv", "source_vertex", "cut_vertex", "seam_pairs", "center")
 OPTIONAL = ("lattice", "ends", "caps", "given_uv")
+_LARGE = 200_000  # faces
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,7 @@ class Surface:
     caps: np.ndarray | None = field(default=None, repr=False)
     given_uv: np.ndarray | None = field(default=None, repr=False)
     raw: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
+    _made: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def load(
@@ -361,7 +367,28 @@ class Surface:
 
     def at(self, uv: np.ndarray) -> np.ndarray:
         """The points (N, 3) of the mesh, in normalised units, at points (N, 2) of Ω."""
-        return self.domain.locate(uv, self.uv, self.faces).take(self.vertices, self.faces)
+        return self.layout.locate(uv).take(self.vertices, self.faces)
+
+    @property
+    def layout(self) -> Layout:
+        """The mesh over Ω, on which points of Ω are looked up."""
+        return self._kept("layout", lambda: self.domain.layout(self.uv, self.faces))
+
+    @property
+    def locator(self) -> Locator:
+        """The mesh in space without caps, on which points near it are looked up."""
+        faces = self.faces if self.caps is None else self.faces[~self.caps]
+        return self._kept("locator", lambda: Locator(self.vertices, faces))
+
+    def _kept(self, name: str, make: Callable[[], T]) -> T:
+        """What ``make()`` makes of the mesh, for the next call too; of a large mesh for one call,
+        as it takes more memory than the mesh."""
+        if len(self.faces) > _LARGE:
+            return make()
+        if name not in self._made:
+            self._made[name] = make()
+        made: T = self._made[name]
+        return made
 
     @property
     def bounding_box_diagonal(self) -> float:

@@ -39,8 +39,9 @@ def inverted(
     """
     x = start.clone()
     moving = torch.arange(len(x), device=x.device)
+    evaluated = cast(PointMap, h).value_and_jacobian
+    value, jacobian = (part.clone() for part in evaluated(x))
     for _ in range(_STEPS):
-        value, jacobian = cast(PointMap, h).value_and_jacobian(x[moving])
         off = targets[moving] - value
         distance = off.norm(dim=1)
         safe = torch.linalg.det(jacobian).abs() > 1e-12
@@ -55,50 +56,64 @@ def inverted(
             trial = x[index] + step[left]
             if project is not None:
                 trial = project(trial)
-            now = (targets[index] - h(trial)).norm(dim=1) < (1 - _NEARER) * distance[left]
+            # most steps are taken: the Jacobian is for the next one
+            there, slope = evaluated(trial)
+            now = (targets[index] - there).norm(dim=1) < (1 - _NEARER) * distance[left]
             x[index[now]] = trial[now]
+            value[left[now]], jacobian[left[now]] = there[now], slope[now]
             moved[left[now]] = True
             left = left[~now]
             step[left] *= _SHRINK
-        moving = moving[moved]  # the others would only try the same steps again
+        # the others would only try the same steps again
+        moving, value, jacobian = (part[moved] for part in (moving, value, jacobian))
         if len(moving) == 0:
             break
     return x
 
 
-@torch.no_grad()
-def preimages(
-    h: nn.Module,
-    targets: Tensor,
-    nodes: Tensor,
-    project: Callable[[Tensor], Tensor] | None = None,
-) -> Tensor:
-    """Points x (N, 2) with h(x) = targets (N, 2), wherever they lie.
+class Inverse:
+    """h⁻¹ of a planar map that does not change.
 
     Args:
-        h, targets: as for :func:`inverted`.
-        project: where h maps Ω onto itself, from points (N, 2) to the nearest ones of Ω, for which
-            targets outside, by rounding, stand.
+        h: as for :func:`inverted`.
         nodes: (M, 2); Newton's method starts from the few whose images under h are nearest to a
             target, until one leads to it.
+        project: where h maps Ω onto itself, from points (N, 2) to the nearest ones of Ω, for which
+            targets outside, by rounding, stand.
     """
-    if project is not None:
-        targets = project(targets)
-    images = h(nodes)
-    tree = cKDTree(images.cpu().numpy())
-    _, near = tree.query(targets.cpu().numpy(), k=[*range(1, min(_STARTS, len(images)) + 1)])
-    starts = nodes[torch.as_tensor(near, device=nodes.device)]
-    result = inverted(h, targets, starts[:, 0], project)
-    off = (h(result) - targets).norm(dim=1)
-    for k in range(1, starts.shape[1]):
-        missed = (off > _ENOUGH).nonzero()[:, 0]
-        if len(missed) == 0:
-            break
-        other = inverted(h, targets[missed], starts[missed, k], project)
-        distance = (h(other) - targets[missed]).norm(dim=1)
-        better = distance < off[missed]
-        result[missed[better]], off[missed[better]] = other[better], distance[better]
-    return result
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        h: nn.Module,
+        nodes: Tensor,
+        project: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
+        self.h, self.nodes, self.project = h, nodes, project
+        self._images = cKDTree(h(nodes).cpu().numpy())
+
+    @torch.no_grad()
+    def __call__(self, targets: Tensor) -> Tensor:
+        """Points x (N, 2) with h(x) = targets (N, 2), wherever they lie."""
+        h, project = self.h, self.project
+        if project is not None:
+            targets = project(targets)
+        result = inverted(h, targets, self._start(targets, 1), project)
+        off = (h(result) - targets).norm(dim=1)
+        for k in range(2, min(_STARTS, len(self.nodes)) + 1):
+            missed = (off > _ENOUGH).nonzero()[:, 0]
+            if len(missed) == 0:
+                break
+            other = inverted(h, targets[missed], self._start(targets[missed], k), project)
+            distance = (h(other) - targets[missed]).norm(dim=1)
+            better = distance < off[missed]
+            result[missed[better]], off[missed[better]] = other[better], distance[better]
+        return result
+
+    def _start(self, targets: Tensor, k: int) -> Tensor:
+        """The nodes with the k-th nearest images."""
+        near = self._images.query(targets.cpu().numpy(), k=[k])[1][:, 0]
+        return self.nodes[torch.as_tensor(near, device=self.nodes.device)]
 
 
 class _Inverse(torch.autograd.Function):
@@ -136,7 +151,7 @@ class TransitionMap(nn.Module):
 
     Args:
         first, second: h_i and h_j, from the common domain.
-        nodes: (M, 2) points of the common domain (see :func:`preimages`).
+        nodes: (M, 2) points of the common domain (see :class:`Inverse`).
         project: from points (N, 2) to the nearest ones of the common domain, if h_i keeps to it.
     """
 
@@ -176,4 +191,4 @@ class TransitionMap(nn.Module):
 
     def back(self, x: Tensor) -> Tensor:
         """h_i⁻¹: (N, 2) to points (N, 2) of the common domain."""
-        return preimages(self.first, x, self.nodes, self.project)
+        return Inverse(self.first, self.nodes, self.project)(x)

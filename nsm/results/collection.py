@@ -6,7 +6,7 @@ import copy
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
 from nsm.maps import PlanarMap, TransitionMap
-from nsm.maps.inverse import preimages
+from nsm.maps.inverse import Inverse
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, combined
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
@@ -54,6 +54,7 @@ class SurfaceCollection:
     config: dict[str, Any] = field(default_factory=dict, repr=False)
     corrections: dict[tuple[int, int], Correction] = field(default_factory=dict, repr=False)
     _made: dict[tuple[int, int], SurfaceMap] = field(default_factory=dict, repr=False)
+    _inverses: dict[int, Inverse] = field(default_factory=dict, repr=False)
     _back: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
     _marked: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
@@ -123,9 +124,7 @@ class SurfaceCollection:
         first, second = (_double(self.maps[n]) for n in (source, target))
         s = self.surfaces[source].surface
         h = TransitionMap(first, second, self._nodes(source), self._project).eval()
-        if source not in self._back:  # h_i⁻¹ takes longest, and all maps of a source share it
-            uv = torch.as_tensor(s.uv)
-            self._back[source] = torch.cat([h.back(part) for part in uv.split(_CHUNK)]).numpy()
+        image = evaluate(h.second, self._preimages(source))
         return SurfaceMap(
             self.surfaces[source],
             self.surfaces[target],
@@ -134,8 +133,22 @@ class SurfaceCollection:
             {},
             self.config,
             self.corrections.get((source, target), Correction()),
-            s.domain.copied(s.uv, s.seam_pairs, evaluate(h.second, self._back[source])),
+            s.domain.copied(s.uv, s.seam_pairs, image),
         )
+
+    def _preimages(self, source: int) -> np.ndarray:
+        """h_i⁻¹ at the vertices of a surface: (V, 2) in the common domain."""
+        if source not in self._back:  # it takes longest, and all maps of a source share it
+            self._back[source] = self._pulled_back(source, self.surfaces[source].surface.uv)
+        return self._back[source]
+
+    def _pulled_back(self, source: int, uv: np.ndarray) -> np.ndarray:
+        """h_i⁻¹ at points (N, 2) of a surface's domain: (N, 2) in the common domain."""
+        if source not in self._inverses:
+            h, nodes = _double(self.maps[source]), self._nodes(source)
+            self._inverses[source] = Inverse(h, nodes, self._project)
+        parts = torch.as_tensor(uv).split(_CHUNK)
+        return torch.cat([self._inverses[source](part) for part in parts]).numpy()
 
     @property
     def _project(self) -> Callable[[Tensor], Tensor] | None:
@@ -167,7 +180,7 @@ class SurfaceCollection:
             s, h = self.surfaces[number].surface, _double(self.maps[number])
             uv, ids = torch.as_tensor(s.uv), self.landmarks[:, number]
             targets = uv[s.cut_vertex[ids[ids >= 0]]]
-            found = preimages(h, targets, h.back(uv), self._project)  # type: ignore[operator]
+            found = Inverse(h, h.back(uv), self._project)(targets)  # type: ignore[operator]
             places = found.new_full((len(ids), 2), torch.nan)
             places[torch.as_tensor(ids >= 0)] = found
             self._marked[number] = places
@@ -255,32 +268,68 @@ def collection_metrics(
     figures: dict[str, Any] = {"pairs": pairs, **collection.certificate}
     cycles = list(itertools.permutations(range(len(collection)), 3))
     cycles = cycles[:: -(-len(cycles) // _MOST_CYCLES)]
-    for name, error in (("", _cycle_error), ("_networks", _networks_cycle_error)):
-        errors = [error(collection, *cycle) for cycle in counted("cycles measured", cycles)]
+    for name, followed in (("", _Followed), ("_networks", _FollowedByNetworks)):
+        paths = followed(collection)
+        errors = [paths.error(*cycle) for cycle in counted("cycles measured", cycles)]
         figures[f"cycle_error{name}_mean_percent"] = float(np.mean([e.mean() for e in errors]))
         figures[f"cycle_error{name}_max_percent"] = float(max(e.max() for e in errors))
     return figures
 
 
-def _cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
-    """Distances (V,) of vertices of i from their images by i→j→k→i, in percent of the diagonal."""
-    surface = collection.surfaces[i]
-    start = surface.in_original_units(surface.surface.vertices[::_CYCLE_EVERY])
-    points = start
-    for a, b in ((i, j), (j, k), (k, i)):
-        points = collection.pair(a, b)(points)
-    diagonal = surface.surface.bounding_box_diagonal / surface.surface.scale
-    return 100 * np.linalg.norm(points - start, axis=1) / diagonal
+class _Followed:
+    """Vertices of the surfaces, followed from one to the next."""
+
+    def __init__(self, collection: SurfaceCollection) -> None:
+        self.collection = collection
+        self.after = cache(self._after)  # cycles begin alike
+
+    def error(self, i: int, j: int, k: int) -> np.ndarray:
+        """Distances (V,) of vertices of i from their images by i→j→k→i, in percent of the
+        diagonal."""
+        surface = self.collection.surfaces[i].surface
+        return self._off(self.after(i, j, k, i), i) * 100 / surface.bounding_box_diagonal
+
+    def _after(self, *path: int) -> np.ndarray:
+        """Where vertices of the first surface of a path are on the last one, (V, 3)."""
+        *before, last = path
+        if not before:
+            surface = self.collection.surfaces[last]
+            return surface.in_original_units(surface.surface.vertices[::_CYCLE_EVERY])
+        return self.collection.pair(before[-1], last)(self.after(*before))
+
+    def _off(self, points: np.ndarray, i: int) -> np.ndarray:
+        """How far points (V, 3) of a surface are from its vertices, in normalised units."""
+        scale = self.collection.surfaces[i].surface.scale
+        return np.asarray(np.linalg.norm(points - self.after(i), axis=1) * scale)
 
 
-def _networks_cycle_error(collection: SurfaceCollection, i: int, j: int, k: int) -> np.ndarray:
-    """As :func:`_cycle_error`, by the networks alone, from domain to domain."""
-    surface = collection.surfaces[i].surface
-    uv = surface.uv[::_CYCLE_EVERY]
-    for a, b in ((i, j), (j, k), (k, i)):
-        uv = surface.domain.canonical(evaluate(collection.pair(a, b).map, uv))
-    off = np.linalg.norm(surface.at(uv) - surface.vertices[::_CYCLE_EVERY], axis=1)
-    return 100 * off / surface.bounding_box_diagonal
+class _FollowedByNetworks(_Followed):
+    """The same by the networks alone, from domain to domain."""
+
+    def __init__(self, collection: SurfaceCollection) -> None:
+        super().__init__(collection)
+        self.common = cache(self._common)
+
+    def _after(self, *path: int) -> np.ndarray:
+        """As points (V, 2) of the last surface's domain."""
+        *before, last = path
+        surface = self.collection.surfaces[last].surface
+        if not before:
+            return surface.uv[::_CYCLE_EVERY]
+        image = evaluate(_double(self.collection.maps[last]), self.common(*before))
+        return surface.domain.canonical(image)
+
+    def _common(self, *path: int) -> np.ndarray:
+        """As points (V, 2) of the common domain."""
+        if len(path) == 1:
+            return self.collection._preimages(path[0])[::_CYCLE_EVERY]
+        return self.collection._pulled_back(path[-1], self.after(*path))
+
+    def _off(self, points: np.ndarray, i: int) -> np.ndarray:
+        surface = self.collection.surfaces[i].surface
+        return np.asarray(
+            np.linalg.norm(surface.at(points) - surface.vertices[::_CYCLE_EVERY], axis=1)
+        )
 
 
 def _common(landmarks: np.ndarray) -> np.ndarray:

@@ -78,7 +78,7 @@ def cycle_picture(path: str | Path, collection: SurfaceCollection) -> None:
         uv = last.uv
         for source, target in reversed(list(itertools.pairwise(ring[: end + 1]))):
             f, s = collection.pair(source, target), collection.surfaces[source].surface
-            uv = s.domain.carried(uv, f.image_uv, s.uv, s.faces, s.seam_pairs)
+            uv = f.image_layout.carried(uv, s.uv, s.seam_pairs)
         view = View(last.vertices, _CELL)
         title = " → ".join(collection.names[k] for k in ring[max(0, end - 1) : end + 1])
         drawn.append((view.draw(last.vertices, last.faces, checked(uv), last.seam_pairs), title))

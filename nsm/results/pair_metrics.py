@@ -164,8 +164,8 @@ def _covered_percent(source: Surface, target: Surface, image_uv: np.ndarray) -> 
     face = random.choice(len(areas), size=_COVER_SAMPLES, p=areas / areas.sum())
     weights = random.dirichlet(np.ones(3), size=_COVER_SAMPLES)
     uv = (weights[:, :, None] * target.uv[target.faces[face]]).sum(axis=1)
-    domain = source.domain
+    image = source.domain.layout(image_uv, source.faces)
     if source.caps is not None:
-        return 100 * float((~source.caps[domain.locate(uv, image_uv, source.faces).face]).mean())
-    nearest = domain.carried(uv, image_uv, image_uv, source.faces, source.seam_pairs)
+        return 100 * float((~source.caps[image.locate(uv).face]).mean())
+    nearest = image.carried(uv, image_uv, source.seam_pairs)
     return 100 * float((np.linalg.norm(nearest - uv, axis=1) <= ON_BOUNDARY).mean())

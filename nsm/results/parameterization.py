@@ -23,7 +23,6 @@ from nsm.results.evaluation import evaluate_double
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
 from nsm.results.networks import network_of
 from nsm.results.points import as_points
-from nsm.surfaces.location import locate
 from nsm.surfaces.topology import face_areas
 
 FORMAT = "nsm-parameterization"
@@ -57,7 +56,7 @@ class Parameterization:
         """
         s = self.phi.surface
         uv = as_points(uv, 2, "points of the domain")
-        return locate(uv, s.uv, s.faces).take(self.uv, s.faces)
+        return s.layout.locate(uv).take(self.uv, s.faces)
 
     def module(self) -> Placed:
         """h as a torch module from Ω to the plane, (N, 2) to (N, 2), with ``value_and_jacobian``.

@@ -154,7 +154,7 @@ def planar_moved(f: SurfaceMap, uv: Tensor) -> Tensor:
     check_points(uv, "points of the domain")
     at, s = uv.detach().cpu().double().numpy(), f.source.surface
     value = f.planar(at)
-    corners = s.faces[s.domain.locate(at, s.uv, s.faces).face]
+    corners = s.faces[s.layout.locate(at).face]
     before, after = (
         np.stack([x[corners[:, k]] - x[corners[:, 0]] for k in (1, 2)], axis=2)
         for x in (s.uv, f.image_uv)
@@ -197,7 +197,10 @@ def _pieces(f: SurfaceMap, points: Tensor, image: Image, back: bool) -> Callable
         reached = like(e.uv)
     weights = like(places.weights)
     uv = (weights[:, :, None] * laid_out).sum(dim=1).detach().cpu().double().numpy()
-    found = off_rims(e, e.domain.locate(uv, reached.detach().cpu().double().numpy(), e.faces))
+    layout = e.layout
+    if back:
+        layout = e.domain.layout(reached.detach().cpu().double().numpy(), e.faces)
+    found = off_rims(e, layout.locate(uv))
     absent, nan = on_caps(e, found.face), torch.tensor(torch.nan, dtype=kind, device=points.device)
     at, ends = like(found.weights), reached[e.faces[found.face]]
     near = (at[:, :, None] * ends).sum(dim=1).detach()

@@ -15,6 +15,7 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 
+from nsm.domains import Layout
 from nsm.domains.caps import off_rims, on_caps
 from nsm.errors import NsmError
 from nsm.results.artifact import NeuralSurface, save_surface
@@ -108,8 +109,8 @@ class SurfaceMap:
             return moved(self, points, fixed_image(self), back=True)
         s, t = self.source.surface, self.target.surface
         uv = located(t, points, "points on the target").take(t.uv, t.faces)
-        preimage = s.domain.carried(uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
-        found = off_rims(s, s.domain.locate(preimage, s.uv, s.faces))
+        preimage = self.image_layout.carried(uv, s.uv, s.seam_pairs)
+        found = off_rims(s, s.layout.locate(preimage))
         points = self.source.in_original_units(found.take(s.vertices, s.faces))
         points[on_caps(s, found.face)] = np.nan
         return points
@@ -220,7 +221,7 @@ class SurfaceMap:
             return planar_moved(self, uv)
         s = self.source.surface
         uv = as_points(uv, 2, "points of the domain")
-        return s.domain.carried(uv, s.uv, self.image_uv, s.faces, s.seam_pairs)
+        return s.layout.carried(uv, self.image_uv, s.seam_pairs)
 
     @cached_property
     def _uncorrected(self) -> np.ndarray:
@@ -233,6 +234,13 @@ class SurfaceMap:
     def image_uv(self) -> np.ndarray:
         """Images (V, 2) of the source's vertices in the target's domain, with the correction."""
         return self.correction.of(self._uncorrected)
+
+    @property
+    def image_layout(self) -> Layout:
+        """The source's mesh as the map lays it out over the target's domain. It is not kept: a
+        collection has many maps."""
+        s = self.source.surface
+        return s.domain.layout(self.image_uv, s.faces)
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
@@ -293,8 +301,8 @@ class SurfaceMap:
         if absent.any():
             return given.where(~absent, lambda there: self.places(there, back=back))
         if back:
-            return off_rims(s, s.domain.locate(given.take(t.uv, t.faces), self.image_uv, s.faces))
-        return t.domain.locate(given.take(self.image_uv, s.faces), t.uv, t.faces)
+            return off_rims(s, self.image_layout.locate(given.take(t.uv, t.faces)))
+        return t.layout.locate(given.take(self.image_uv, s.faces))
 
     @cached_property
     def weld(self) -> Weld:
@@ -313,13 +321,12 @@ class SurfaceMap:
 
     @cached_property
     def _forth(self) -> Places:
-        t = self.target.surface
-        return t.domain.locate(self.image_uv, t.uv, t.faces)
+        return self.target.surface.layout.locate(self.image_uv)
 
     @cached_property
     def _back(self) -> Places:
         s, t = self.source.surface, self.target.surface
-        return off_rims(s, s.domain.locate(t.uv, self.image_uv, s.faces))
+        return off_rims(s, self.image_layout.locate(t.uv))
 
     @cached_property
     def source_uv(self) -> np.ndarray:
@@ -328,7 +335,7 @@ class SurfaceMap:
         At those that are :attr:`unreached` too, where h⁻¹ is that of the closed source.
         """
         s, t = self.source.surface, self.target.surface
-        return s.domain.carried(t.uv, self.image_uv, s.uv, s.faces, s.seam_pairs)
+        return self.image_layout.carried(t.uv, s.uv, s.seam_pairs)
 
     def transfer(self, values: np.ndarray, *, back: bool = False) -> np.ndarray:
         """Transfer values at the source's vertices to the target's, or back.

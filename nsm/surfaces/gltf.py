@@ -10,9 +10,8 @@ import json
 import struct
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
-from trimesh.resolvers import Resolver
+from nsm.surfaces.folder_files import read_below
 
 _LARGEST_JSON = 100 * 2**20  # bytes
 _MOST_NODES = 10_000  # of a scene, with repetitions
@@ -20,42 +19,6 @@ _DEEPEST = 100  # nested nodes
 _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _UNMOVED = {"offset": [0, 0], "scale": [1, 1], "rotation": 0, "texCoord": 0}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-
-
-class FolderResolver(Resolver):
-    """Reads the files that a mesh file names, but only from its folder and the folders below.
-
-    Args:
-        folder: the folder of the mesh file.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder.resolve()
-
-    def get(self, key: str) -> bytes:
-        """The contents of a file.
-
-        Raises:
-            ValueError: the file is outside the folder, or not a regular file.
-        """
-        file = (self.folder / unquote(str(key))).resolve()
-        if not file.is_relative_to(self.folder):
-            raise ValueError(f"it refers to {key!r}, outside its folder")
-        if not file.is_file():
-            raise ValueError(f"it refers to the missing file {key!r}")
-        return file.read_bytes()
-
-    def write(self, name: str, data: bytes) -> None:
-        """Refuse to write."""
-        raise ValueError("reading a mesh writes nothing")
-
-    def namespaced(self, namespace: str) -> FolderResolver:
-        """The resolver of a folder below."""
-        return FolderResolver(self.folder / namespace)
-
-    def keys(self) -> list[str]:
-        """Nothing: the files are not listed."""
-        return []
 
 
 def check_gltf(file: Path) -> None:
@@ -96,11 +59,10 @@ def check_images(file: Path) -> None:
     Raises:
         ValueError: one is missing, or outside the folder.
     """
-    resolver = FolderResolver(file.parent)
     for image in _listed(_tree(file), "images"):
         place = str(image.get("uri", "data:"))
         if not place.startswith("data:"):
-            resolver.get(place)
+            read_below(file.parent, place)
 
 
 def check_textures(file: Path) -> None:

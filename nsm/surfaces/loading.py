@@ -330,7 +330,8 @@ def read_scene(file: Path) -> list[Any]:
     """
     import trimesh
 
-    from nsm.surfaces.gltf import FolderResolver, check_gltf
+    from nsm.surfaces.folder_resolver import FolderResolver
+    from nsm.surfaces.gltf import check_gltf
 
     kind = file.suffix.lower()[1:]
     if kind in ("gltf", "glb"):

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from nsm.surfaces.gltf import FolderResolver, check_images, check_textures
+from nsm.surfaces.folder_files import read_below
+from nsm.surfaces.gltf import check_images, check_textures
 from nsm.surfaces.loading import check_file, error_in, is_number
 
 # The base colour of a material, (H, W, C) uint8, which is read when it is called: an image that is
@@ -76,10 +77,9 @@ def _beside(mesh: Path, name: str) -> np.ndarray:
     Programs write the paths of the machine they ran on.
     """
     words = name.replace("\\", "/")
-    resolver = FolderResolver(mesh.parent)
     for candidate in (words, words.rsplit("/", 1)[-1]):
         try:
-            return _decoded(resolver.get(candidate), mesh.parent / candidate)
+            return _decoded(read_below(mesh.parent, candidate), mesh.parent / candidate)
         except ValueError:
             continue
     raise error_in(
@@ -95,15 +95,14 @@ def read_libraries(mesh: Path, names: Sequence[str]) -> dict[str, Paint]:
     ``Kd`` colours a material without ``map_Kd``.
     """
     colours: dict[str, Paint] = {}
-    resolver = FolderResolver(mesh.parent)
     for name in names:
         # a name may have spaces, and there may be several names
         for one in [name] if (mesh.parent / name).is_file() else name.split():
             try:
-                text = resolver.get(one.replace("\\", "/")).decode("utf-8-sig", errors="replace")
+                data = read_below(mesh.parent, one.replace("\\", "/"))
             except ValueError:
                 continue
-            colours.update(_materials(mesh, text))
+            colours.update(_materials(mesh, data.decode("utf-8-sig", errors="replace")))
     return colours
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.energies import At, first_fundamental_form
-from nsm.maps.inverse import preimages
+from nsm.maps.inverse import Inverse
 from nsm.tasks.mesh_quadrature import MOST, MeshQuadrature, Triangles, triangles
 
 _FOUND = 1e-6  # in Ω
@@ -144,7 +144,7 @@ class CollectionQuadrature(nn.Module):
         """
         part = self._part(number)
         exact, uv = copy.deepcopy(h).cpu().double(), part.uv.cpu().double()
-        x = preimages(exact, uv, exact.back(uv), self.project)
+        x = Inverse(exact, exact.back(uv), self.project)(uv)
         off = (exact(x) - uv).norm(dim=1, keepdim=True)
         x = torch.where(off < _FOUND, x, torch.nan).to(part.uv)
         each: Any = self.each[number]

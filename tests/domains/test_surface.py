@@ -2,7 +2,9 @@
 
 import hashlib
 import http.server
+import pickle
 import threading
+from dataclasses import replace
 from functools import partial
 
 import igl
@@ -192,6 +194,20 @@ def test_options_that_cannot_be_met(options, kind, key):
 def test_a_closed_shape_needs_two_seam_vertices():
     with pytest.raises(NsmError):
         Surface.from_arrays(*catalogue_mesh("sphere"), seam_vertices=[7, 7])
+
+
+def test_what_points_are_looked_up_on_is_kept_of_meshes_that_are_not_large(monkeypatch):
+    surface = Surface.load("hemisphere", cache=False)
+    points = surface.at(surface.uv[:9])
+    assert surface.layout is surface.layout and surface.locator is surface.locator
+    moved = replace(surface, uv=surface.uv @ [[0.0, 1.0], [-1.0, 0.0]])
+    assert moved.layout is not surface.layout
+    np.testing.assert_allclose(moved.at(moved.uv[:9]), points, atol=1e-12)
+    again = pickle.loads(pickle.dumps(surface))
+    np.testing.assert_array_equal(again.at(surface.uv[:9]), points)
+    monkeypatch.setattr("nsm.domains.surface._LARGE", len(surface.faces) - 1)
+    assert surface.layout is not surface.layout
+    np.testing.assert_array_equal(surface.at(surface.uv[:9]), points)
 
 
 def test_preimages_are_uv_of_file_vertices():

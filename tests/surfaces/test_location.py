@@ -1,5 +1,10 @@
 """Nearest points on meshes."""
 
+import copy
+import pickle
+import subprocess
+import sys
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +13,7 @@ from nsm.energies import symmetric_dirichlet
 from nsm.results.map_metrics import triangle_metric
 from nsm.surfaces import shapes
 from nsm.surfaces.geometry import triangle_distortion
-from nsm.surfaces.location import locate
+from nsm.surfaces.location import Locator, locate
 
 
 @given(st.integers(0, 2**31))
@@ -28,6 +33,29 @@ def test_points_outside_go_to_the_nearest_point():
     uv, faces = shapes.grid_mesh(5)
     places = locate(np.array([[2.0, 0.25], [-3.0, 3.0]]), uv, faces)
     assert np.abs(places.take(uv, faces) - [[1, 0.25], [-1, 1]]).max() < 1e-12
+
+
+def test_a_locator_serves_many_calls_and_can_be_copied():
+    vertices, faces = shapes.sphere(3)
+    locator = Locator(vertices, faces)
+    for one in (locator, copy.deepcopy(locator), pickle.loads(pickle.dumps(locator))):
+        for points in (vertices[:5] * 1.1, vertices[5:50] * 0.9, vertices[:0]):
+            face, weights = one.locate(points)
+            alone = locate(points, vertices, faces)
+            np.testing.assert_array_equal(face, alone.face)
+            np.testing.assert_array_equal(weights, alone.weights)
+
+
+def test_a_locator_that_lives_to_the_end_of_python_is_not_warned_of():
+    code = """
+import ctypes
+from nsm.surfaces import shapes
+from nsm.surfaces.location import Locator
+kept = Locator(*shapes.sphere(2))
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_values_of_any_shape_are_interpolated():

@@ -15,8 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from nsm.domains.orbifold import group
-from nsm.domains.orbifold.cover import lifted_near, triangles_over_domain
+from nsm.domains.orbifold.cover import lifted_near
 from nsm.domains.orbifold.domain import ClosedDomain
 from nsm.domains.orbifold.embedding import SIDE, reduced_basis
 from nsm.domains.surface import Surface
@@ -114,18 +113,20 @@ def alignments(
     found = _candidates(source, target)
     if domain.even:
         cone = np.logical_and(*((x == np.rint(x)).all(axis=1) for x in (p, q)))
-        classes = [
-            (b, np.array(c, dtype=float))
-            for b in found
-            for c in product((0, 1), repeat=2)
-            if (np.mod(p[cone] @ b.T + c - q[cone], 2) == 0).all()
-        ][:_CLASSES]
+        shift = np.array(list(product((0.0, 1.0), repeat=2)))
+        off = p[cone] @ found.transpose(0, 2, 1) - q[cone]  # (M, L, 2)
+        held = (np.mod(off[:, None] + shift[:, None], 2) == 0).all(axis=(2, 3))
+        of_b, of_c = (number[:_CLASSES] for number in np.nonzero(held))
+        classes = found[of_b], shift[of_c]
     elif len(p):
-        classes = [(b, pair.mean_shift(b)) for b in found[: _CLASSES // 4]]
+        some = found[: _CLASSES // 4]
+        classes = some, np.stack([pair.mean_shift(b) for b in some])
     else:
         classes = pair.best_shifts(found[: _CLASSES // 16])
-    first = sorted((pair.alignment(b, c, _FEW) for b, c in classes), key=lambda a: a.score)
-    best = [pair.alignment(a.matrix, a.shift) for a in first[:_FINALISTS]]
+    first = sorted(pair.alignments(*classes, _FEW), key=lambda a: a.score)[:_FINALISTS]
+    matrices = np.array([a.matrix for a in first]).reshape(-1, 2, 2)
+    shifts = np.array([a.shift for a in first]).reshape(-1, 2)
+    best = pair.alignments(matrices, shifts)
     return sorted(best, key=lambda a: a.score)
 
 
@@ -140,9 +141,9 @@ def _domain(surface: Surface) -> ClosedDomain:
     return surface.domain
 
 
-def _candidates(source: Surface, target: Surface) -> list[np.ndarray]:
-    """Matrices B (2, 2) of SL(2, Z), one of each pair ±B on the orbifold, that change the lattices'
-    shapes least, in the order of the larger singular value of L_t B L_s⁻¹."""
+def _candidates(source: Surface, target: Surface) -> np.ndarray:
+    """Matrices B (M, 2, 2) of SL(2, Z), one of each pair ±B on the orbifold, that change the
+    lattices' shapes least, in the order of the larger singular value of L_t B L_s⁻¹."""
     assert source.lattice is not None and target.lattice is not None
     bases = [reduced_basis(s.lattice) for s in (source, target) if s.lattice is not None]
     one, other = source.lattice @ bases[0], target.lattice @ bases[1]
@@ -160,7 +161,7 @@ def _candidates(source: Surface, target: Surface) -> list[np.ndarray]:
     # determinant 1: the sum of squares orders as the larger singular value does
     order = np.argsort((change**2).sum(axis=(1, 2)).round(9), kind="stable")
     back = np.rint(np.linalg.inv(bases[0])).astype(np.int64)
-    return [bases[1] @ m @ back for m in matrix[order]]
+    return np.asarray(bases[1] @ matrix[order] @ back)
 
 
 class Judge:
@@ -170,8 +171,6 @@ class Judge:
     def __init__(
         self, source: Surface, target: Surface, landmarks: Landmarks | None = None
     ) -> None:
-        import igl
-
         self.source, self.target = source, target
         given = landmarks or (np.zeros(0, dtype=int),) * 2
         self.p, self.q = (
@@ -184,82 +183,95 @@ class Judge:
         self.rest = _forms(source.vertices, source.uv, source.faces)
         self.area = topology.face_areas(source.vertices, source.faces)
         self.forms = _forms(target.vertices, target.uv, target.faces)
-        over, self.number, _ = triangles_over_domain(target.uv[target.faces], self.even)
-        self.points = np.ascontiguousarray(np.pad(over.reshape(-1, 2), ((0, 0), (0, 1))))
-        self.faces = np.arange(len(self.points)).reshape(-1, 3)
-        self.tree = igl.AABB()
-        self.tree.init(self.points, self.faces)
         assert target.lattice is not None
         self.shape = target.lattice / SIDE
 
     def alignment(self, matrix: np.ndarray, shift: np.ndarray, count: int = _MANY) -> Alignment:
         """Judged by about ``count`` of the source's triangles."""
+        return self.alignments(matrix[None], shift[None], count)[0]
+
+    def alignments(
+        self, matrices: np.ndarray, shifts: np.ndarray, count: int = _MANY
+    ) -> list[Alignment]:
+        """Of matrices (M, 2, 2) and shifts (M, 2), each as :meth:`alignment`."""
         chosen = np.unique(np.linspace(0, len(self.area) - 1, count).astype(int))
-        image = self.middle[chosen] @ matrix.T + shift
-        x, _ = group.into_domain(image / SIDE, self.even)
-        places = np.ascontiguousarray(np.pad(SIDE * x, ((0, 0), (0, 1))))
-        _, face, _ = self.tree.squared_distance(self.points, self.faces, places)
-        forms = self.forms[self.number[np.asarray(face).ravel()]]
-        value = _symmetric_dirichlet(self.rest[chosen], matrix.T @ forms @ matrix)
-        distortion = float(np.average(np.log(value), weights=self.area[chosen]))
-        return Alignment(matrix, shift, distortion, self.miss(matrix, shift))
+        image = self.middle[chosen] @ matrices.transpose(0, 2, 1) + shifts[:, None]
+        face = self.target.layout.locate(image.reshape(-1, 2)).face.reshape(image.shape[:2])
+        value = _symmetric_dirichlet(self.rest[chosen], _pulled_back(self.forms[face], matrices))
+        distortion = np.average(np.log(value), axis=1, weights=self.area[chosen])
+        misses = self.misses(matrices, shifts)
+        figures = zip(matrices, shifts, distortion.tolist(), misses, strict=True)
+        return [Alignment(*one) for one in figures]
 
-    def miss(self, matrix: np.ndarray, shift: np.ndarray) -> float:
-        """Root mean square distance of the landmarks."""
+    def misses(self, matrices: np.ndarray, shifts: np.ndarray) -> list[float]:
+        """Root mean square distances of the landmarks."""
         if len(self.p) == 0:
-            return 0.0
-        gap = self.gap(matrix, shift) @ self.shape.T
-        return float(np.sqrt((gap**2).sum(axis=1).mean()))
+            return [0.0] * len(matrices)
+        gap = self.gap(matrices, shifts) @ self.shape.T
+        return [float(x) for x in np.sqrt((gap**2).sum(axis=2).mean(axis=1))]
 
-    def gap(self, matrix: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """From the landmarks' images to the target's nearest lifts: (L, 2)."""
-        image = self.p @ matrix.T + shift
-        return lifted_near(self.q, image, self.even, self.target.lattice) - image
+    def gap(self, matrices: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+        """From the landmarks' images to the target's nearest lifts: (M, L, 2)."""
+        image = self.p @ matrices.transpose(0, 2, 1) + shifts[:, None]
+        wanted = np.tile(self.q, (len(image), 1))
+        lifted = lifted_near(wanted, image.reshape(-1, 2), self.even, self.target.lattice)
+        return lifted.reshape(image.shape) - image
 
     def mean_shift(self, matrix: np.ndarray) -> np.ndarray:
         """The translation of a torus that brings the landmarks together best."""
         angle = np.pi * (self.q - self.p @ matrix.T)
         shift = np.angle(np.exp(1j * angle).mean(axis=0)) / np.pi
         for _ in range(5):  # now the mean of the nearest lifts
-            shift = shift + self.gap(matrix, shift).mean(axis=0)
+            shift = shift + self.gap(matrix[None], shift[None])[0].mean(axis=0)
         return np.mod(shift + 1, SIDE) - 1
 
-    def best_shifts(self, matrices: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Matrices with translations of a torus for which the distortion is least nearby."""
+    def best_shifts(self, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Matrices (M, 2, 2) with translations (M, 2) of a torus for which the distortion is least
+        nearby."""
         step = SIDE / _SHIFTS
         grid = -1 + step * np.array(list(product(range(_SHIFTS), repeat=2)))
         found: list[Alignment] = []
         for matrix in matrices:
-            every = [self.alignment(matrix, c, _FEW) for c in grid]
+            every = self.alignments(np.broadcast_to(matrix, (len(grid), 2, 2)), grid, _FEW)
             score = np.array([a.score for a in every]).reshape(_SHIFTS, _SHIFTS)
             around = [np.roll(score, d, axis=(0, 1)) for d in product((-1, 0, 1), repeat=2)]
             found += [every[k] for k in np.flatnonzero(score <= np.min(around, axis=0))]
+        around_it = step * np.array(list(product((-1, 0, 1), repeat=2)))
         result: list[tuple[np.ndarray, np.ndarray]] = []
         for best in sorted(found, key=lambda a: a.score)[:_FINALISTS]:
-            width = step
-            for _ in range(_HALVINGS):
-                width /= 2
-                near = [
-                    self.alignment(best.matrix, best.shift + width * np.array(d), _FEW)
-                    for d in product((-1, 0, 1), repeat=2)
-                ]
-                best = min([best, *near], key=lambda a: a.score)
+            for k in range(1, _HALVINGS + 1):
+                shifts = best.shift + around_it / 2**k
+                same = np.broadcast_to(best.matrix, (len(shifts), 2, 2))
+                best = min([best, *self.alignments(same, shifts, _FEW)], key=lambda a: a.score)
             result.append((best.matrix, np.mod(best.shift + 1, SIDE) - 1))
-        return result
+        matrix, shift = zip(*result, strict=True)
+        return np.stack(matrix), np.stack(shift)
 
 
 def _forms(vertices: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """First fundamental forms (F, 2, 2) of a mesh (V, 3) over its coordinates (V, 2)."""
-    side, flat = (
-        np.stack([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)], axis=2) for x in (vertices, uv)
-    )
-    jacobian = side @ np.linalg.inv(flat)
-    return np.asarray(jacobian.transpose(0, 2, 1) @ jacobian)
+    """First fundamental forms of a mesh (V, 3) over its coordinates (V, 2), as rows (F, 3) of
+    their entries 11, 12 and 22."""
+    (a, b), (u, v) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (vertices, uv))
+    with np.errstate(all="ignore"):
+        inverse = 1 / (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])[:, None]
+        by_u = (a * v[:, 1:] - b * u[:, 1:]) * inverse
+        by_v = (b * u[:, :1] - a * v[:, :1]) * inverse
+        entries = [
+            np.einsum("fk,fk->f", *two) for two in ((by_u, by_u), (by_u, by_v), (by_v, by_v))
+        ]
+    return np.stack(entries, axis=1)
+
+
+def _pulled_back(forms: np.ndarray, matrices: np.ndarray) -> np.ndarray:
+    """BᵀFB (M, N, 3) of forms F (M, N, 3), as :func:`_forms` has them, and B (M, 2, 2)."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0).astype(np.float64)
+    rows = [[a * a, a * b, b * b], [2 * a * c, a * d + b * c, 2 * b * d], [c * c, c * d, d * d]]
+    return np.asarray(forms @ np.array(rows).transpose(2, 0, 1))
 
 
 def _symmetric_dirichlet(rest: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """tr M + tr (M + εI)⁻¹, at most 1,000, of maps that pull forms (N, 2, 2) back to others."""
-    (e, f, g), (h, m, n) = ((x[:, 0, 0], x[:, 0, 1], x[:, 1, 1]) for x in (rest, image))
+    """tr M + tr (M + εI)⁻¹, at most 1,000, of maps that pull forms (..., 3) back to others."""
+    (e, f, g), (h, m, n) = (np.moveaxis(x, -1, 0) for x in (rest, image))
     with np.errstate(all="ignore"):
         inverse = 1 / (e * g - f * f)
         trace = (g * h - 2 * f * m + e * n) * inverse

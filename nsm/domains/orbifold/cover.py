@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nsm.domains.layout import Layout
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.embedding import SIDE, Embedding, reduced_basis
 from nsm.domains.orbifold.repair import isotopy_class
-from nsm.surfaces.location import Places, locate
+from nsm.surfaces.location import Locator, Places
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -73,58 +74,74 @@ def triangles_over_domain(
     _, home = group.into_domain(corners.mean(axis=1) / SIDE, symmetric)
     corners = SIDE * group.moved(home[:, None], corners / SIDE)
     low = np.array([-1.0, 0.0 if symmetric else -1.0])
+    lowest, highest = (
+        function(function(corners[:, 0], corners[:, 1]), corners[:, 2])
+        for function in (np.minimum, np.maximum)
+    )
     parts, numbers, elements = [], [], []
     for sign in (1, -1) if symmetric else (1,):
-        least, most = (sign * corners).min(axis=1), (sign * corners).max(axis=1)
+        least, most = (lowest, highest) if sign > 0 else (-highest, -lowest)
         first = np.ceil((low - most.max(axis=0)) / SIDE).astype(int)
         last = np.floor((1.0 - least.min(axis=0)) / SIDE).astype(int)
         for shift in product(*(range(a, b + 1) for a, b in zip(first, last, strict=True))):
             by = SIDE * np.array(shift)
-            meets = (most + by >= low).all(axis=1) & (least + by <= 1.0).all(axis=1)
+            meets = np.logical_and(*((most + by >= low) & (least + by <= 1.0)).T)
             parts.append(sign * corners[meets] + by)
             numbers.append(np.flatnonzero(meets))
             elements.append(group.compose(np.array([sign, *shift]), home[meets]))
     return np.concatenate(parts), np.concatenate(numbers), np.concatenate(elements)
 
 
-def located(embedding: Embedding, points: np.ndarray) -> Places:
-    """Where points (N, 2) of Ω, in any lift, lie on the mesh: faces and barycentric weights."""
-    return located_on(embedding.corners(), points, embedding.cones is not None)[0]
-
-
-def located_on(
-    corners: np.ndarray, points: np.ndarray, symmetric: bool
-) -> tuple[Places, np.ndarray]:
-    """As :func:`located`, on triangles (F, 3, 2) that cover Ω, each in one lift; and the elements
-    (N, 3) of the group that move each point's triangle to where the point is."""
-    x, back = group.into_domain(points / SIDE, symmetric)
-    corners, number, element = triangles_over_domain(corners, symmetric)
-    faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    found = locate(SIDE * x, corners.reshape(-1, 2), faces)
-    there = group.compose(group.inverse(back), element[found.face])
-    return Places(number[found.face], found.weights), there
-
-
-def carried(
-    points: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    faces: np.ndarray,
-    copies: np.ndarray,
-    symmetric: bool,
-) -> np.ndarray:
-    """Images (N, 2), in the cover, of points (N, 2) under an equivariant map linear on triangles.
+class Cover:
+    """Triangles that cover Ω, on which points are looked up in any lift.
 
     Args:
-        points: in any lift.
-        before, after: (V, 2) the vertices and their images.
-        faces: (F, 3), each triangle in one lift.
-        copies: (T, 2) vertices that are lifts of one point.
+        corners: (F, 3, 2), each triangle in one lift.
         symmetric: whether x and -x are one point: the orbifold.
     """
-    places, element = located_on(before[faces], points, symmetric)
-    value = places.take(after, faces)
-    matrix, shift = isotopy_class(before, copies, after, symmetric)
-    sign, moves = element[:, :1], element[:, 1:] * SIDE
-    # h(γx) = γ'h(x): for γ = (x ↦ sx + k), γ' is y ↦ sy + Bk + (1 - s)c
-    return sign * value + moves @ matrix.T + (1 - sign) * shift
+
+    def __init__(self, corners: np.ndarray, symmetric: bool) -> None:
+        self.symmetric = symmetric
+        lifts, self._number, self._element = triangles_over_domain(corners, symmetric)
+        self._lifts = Locator(lifts.reshape(-1, 2), np.arange(3 * len(lifts)).reshape(-1, 3))
+
+    def located(self, points: np.ndarray) -> tuple[Places, np.ndarray]:
+        """Where points (N, 2) lie on the triangles, and the elements (N, 3) of the group that move
+        each point's triangle to where the point is."""
+        x, back = group.into_domain(points / SIDE, self.symmetric)
+        found = self._lifts.locate(SIDE * x)
+        there = group.compose(group.inverse(back), self._element[found.face])
+        return Places(self._number[found.face], found.weights), there
+
+
+class ClosedLayout(Layout):
+    """A mesh laid out over Ω = R²/Γ, each triangle in one lift.
+
+    Args:
+        uv, faces: as for :class:`Layout`.
+        symmetric: as for :class:`Cover`.
+    """
+
+    def __init__(self, uv: np.ndarray, faces: np.ndarray, symmetric: bool) -> None:
+        self.uv, self.faces = uv, faces
+        self._cover = Cover(uv[faces], symmetric)
+
+    def locate(self, points: np.ndarray) -> Places:
+        """The places of points (N, 2), in any lift."""
+        return self._cover.located(points)[0]
+
+    def carried(self, points: np.ndarray, after: np.ndarray, copies: np.ndarray) -> np.ndarray:
+        """As :meth:`Layout.carried`: the map is equivariant, and images are in the lifts that it
+        sends the points to."""
+        symmetric = self._cover.symmetric
+        places, element = self._cover.located(points)
+        value = places.take(after, self.faces)
+        matrix, shift = isotopy_class(self.uv, copies, after, symmetric)
+        sign, moves = element[:, :1], element[:, 1:] * SIDE
+        # h(γx) = γ'h(x): for γ = (x ↦ sx + k), γ' is y ↦ sy + Bk + (1 - s)c
+        return sign * value + moves @ matrix.T + (1 - sign) * shift
+
+
+def located(embedding: Embedding, points: np.ndarray) -> Places:
+    """Where points (N, 2) of Ω, in any lift, lie on the mesh: faces and barycentric weights."""
+    return Cover(embedding.corners(), embedding.cones is not None).located(points)[0]

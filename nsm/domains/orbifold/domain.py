@@ -19,13 +19,12 @@ import numpy as np
 from nsm.domains import planar_mesh
 from nsm.domains.base import Domain
 from nsm.domains.orbifold import group
-from nsm.domains.orbifold.cover import carried, located_on, nearest_lifts
+from nsm.domains.orbifold.cover import ClosedLayout, nearest_lifts
 from nsm.domains.orbifold.embedding import SIDE, Embedding, embed_orbifold, embed_torus
 from nsm.domains.orbifold.quotient_mesh import quotient_mesh
 from nsm.domains.orbifold.repair import copied, repaired, torn
 from nsm.errors import NsmError
 from nsm.surfaces import topology
-from nsm.surfaces.location import Places
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -132,24 +131,13 @@ class ClosedDomain(Domain):
         """As :meth:`Domain.copied`."""
         return copied(rest, copies, image, self.even)
 
-    def carried(
-        self,
-        points: np.ndarray,
-        before: np.ndarray,
-        after: np.ndarray,
-        faces: np.ndarray,
-        copies: np.ndarray,
-    ) -> np.ndarray:
-        """As :meth:`Domain.carried`."""
-        return carried(points, before, after, faces, copies, self.even)
-
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Mask (...) of the points (..., 2) of the fundamental domain."""
         return np.asarray(((points >= self.low) & (points <= 1.0)).all(axis=-1))
 
-    def locate(self, points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Places:
-        """The places of points (N, 2), in any lift, on a mesh laid out over Ω."""
-        return located_on(uv[faces], points, self.even)[0]
+    def layout(self, uv: np.ndarray, faces: np.ndarray) -> ClosedLayout:
+        """As :meth:`Domain.layout`; each triangle in one lift, points in any."""
+        return ClosedLayout(uv, faces, self.even)
 
     def canonical(self, points: np.ndarray) -> np.ndarray:
         """As :meth:`Domain.canonical`."""
