@@ -129,12 +129,16 @@ def test_a_coarse_table_is_the_same_spline_on_the_finer_grid(closed):
     assert folding(grid, n, m).shape == (n * m, len(grid.tables[0]))
 
 
-def test_resolutions_follow_the_lattice_and_keep_the_size_of_tables():
+@each
+def test_resolutions_follow_the_lattice_and_tables_of_surfaces_are_a_quarter_larger(closed):
     lattice = np.array([[4.0, 0.0], [0.0, 1.0]])
-    for closed in EVERY:
-        n, m = grid_of(closed, lattice, (128,)).cells(0)
-        assert 3 < n / m < 5
-        assert len(grid_of(closed, lattice, (128,)).tables[0]) == pytest.approx(128**2, rel=0.15)
+    n, m = grid_of(closed, lattice, (128,)).cells(0)
+    assert 3 < n / m < 5
+    size = len(grid_of(closed, lattice, (128,)).tables[0])
+    assert size == pytest.approx(1.25 * 128**2, rel=0.15)
+    settings = {"_target_": "nsm.maps.SplineGrid", "resolutions": [128]}
+    n, m = closed.encoding(settings, of_map=True)["resolutions"][0]
+    assert n * m / (2 if closed.even else 1) == pytest.approx(128**2, rel=0.15)
 
 
 @pytest.mark.parametrize(
