@@ -115,7 +115,7 @@ class Rings:
 
     def least(self, value: np.ndarray) -> np.ndarray:
         """The least value (N,) over each vertex and its neighbours."""
-        return np.minimum(value, np.minimum.reduceat(value[self.indices], self.start))
+        return np.minimum(value, np.minimum.reduceat(value.take(self.indices), self.start))
 
     def apart(self, priority: np.ndarray, distance: int) -> np.ndarray:
         """Mask (N,) of vertices more than ``distance`` (1 or 2) edges apart.
@@ -128,10 +128,10 @@ class Rings:
             for _ in range(distance):
                 lowest = self.least(lowest)
             chosen |= np.isfinite(priority) & (priority == lowest)
-            near = np.where(chosen, -1.0, 0.0)
+            near = chosen.copy()
             for _ in range(distance):
-                near = self.least(near)
-            priority[near < 0] = np.inf
+                near[self.indices[near[self.row]]] = True
+            priority[near] = np.inf
         return chosen
 
 
@@ -150,13 +150,14 @@ def _collapses(
     allowed &= ~held[row]
     if boundary.sum() <= _FEWEST_ON_BOUNDARY:
         allowed &= ~boundary[row]
-    length = np.linalg.norm(points[row] - points[column], axis=1)
+    side = points.T.take(row, axis=1) - points.T.take(column, axis=1)
+    length = np.sqrt(_dot(side, side))
     # random costs: a collapse that fails in one round is tried differently in the next
     cost = np.where(allowed, length * rng.uniform(1.0, 1.7, len(row)), np.inf)
     least = np.minimum.reduceat(cost, rings.start)
     place = np.flatnonzero(np.isfinite(cost) & (cost == least[row]))
-    vertex, first = np.unique(row[place], return_index=True)
-    target = column[place[first]]
+    place = place[np.diff(row[place], prepend=-1) > 0]  # one for each vertex
+    vertex, target = row[place], column[place]
 
     ones = rings.matrix.copy()
     ones.data = np.ones(len(row), dtype=np.int16)
@@ -177,19 +178,35 @@ def _collapses(
 
 def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
     """Mask (N,) of vertices that leave bad triangles if collapsed onto others, ``into``."""
-    result = np.zeros(len(points), dtype=bool)
+    result, points = np.zeros(len(points), dtype=bool), np.ascontiguousarray(points.T)
+    corner = [points.take(faces[:, k], axis=1) for k in range(3)]
+    sides = np.stack([corner[k - 1] - corner[k - 2] for k in range(3)], axis=1)  # opposite each
+    normal = _cross(sides[:, 1], sides[:, 2])
+    double = np.sqrt(_dot(normal, normal))
+    squares = _dot(sides, sides)
+    shape = double / squares.sum(axis=0)
     for k in range(3):
-        v, b, c = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        w = into[v]
-        kept = (w >= 0) & (w != b) & (w != c)
-        v, w, b, c = (points[i[kept]] for i in (v, w, b, c))
-        old, new = np.cross(b - v, c - v), np.cross(b - w, c - w)
-        double = np.linalg.norm(new, axis=1)
-        before = np.linalg.norm(old, axis=1)
-        side = ((b - c) ** 2).sum(axis=1)
-        shape = double / (side + ((b - w) ** 2).sum(axis=1) + ((c - w) ** 2).sum(axis=1))
-        shape_before = before / (side + ((b - v) ** 2).sum(axis=1) + ((c - v) ** 2).sum(axis=1))
-        bad = (old * new).sum(axis=1) < _TURN * double * before
-        bad |= shape < np.minimum(_SHAPE, shape_before)
-        result[faces[kept, k][bad]] = True
+        v, b, c = faces[:, k], faces[:, k - 2], faces[:, k - 1]
+        w = into.take(v)
+        kept = np.flatnonzero((w >= 0) & (w != b) & (w != c))
+        to = points.take(w[kept], axis=1)
+        to_b, to_c = corner[k - 2].take(kept, axis=1) - to, corner[k - 1].take(kept, axis=1) - to
+        new = _cross(to_b, to_c)
+        new_double = np.sqrt(_dot(new, new))
+        new_shape = new_double / (squares[k][kept] + _dot(to_b, to_b) + _dot(to_c, to_c))
+        bad = _dot(normal.take(kept, axis=1), new) < _TURN * new_double * double[kept]
+        bad |= new_shape < np.minimum(_SHAPE, shape[kept])
+        result[v[kept[bad]]] = True
     return result
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of vectors (3, ...), by coordinates."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of vectors (3, ...), by coordinates."""
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )

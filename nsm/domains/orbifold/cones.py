@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from nsm.domains.decimation import coarsen, present_faces
 from nsm.domains.orbifold.lifts import cone_lifts
-from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
+from nsm.domains.orbifold.multiresolution import AREA, Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.errors import NsmError
 from nsm.stages import counted
@@ -211,7 +211,7 @@ class _Candidates:
         self.candidates = np.searchsorted(ids, candidates)
         held = np.zeros(len(ids), dtype=bool)
         held[self.candidates] = True
-        self.levels = hierarchy(self.vertices, self.faces, held, effort)
+        self.levels = hierarchy(self.vertices, self.faces, held, effort, AREA[True])
 
     def score(self, four: np.ndarray) -> tuple[float, np.ndarray]:
         """As :func:`score`, with the cones at four candidates; infinite if there is no layout."""
