@@ -103,15 +103,32 @@ def _has_area(faces: np.ndarray) -> np.ndarray:
 
 
 class Rings:
-    """The neighbours of each of n vertices, all in faces: indices[start[v] : start[v + 1]]."""
+    """The neighbours of each of n vertices, all in faces: indices[start[v] : start[v + 1]].
+
+    Attributes:
+        row: the vertex whose neighbours indices are.
+        on_boundary: mask of the edges to them that have one face.
+    """
 
     def __init__(self, faces: np.ndarray, n: int) -> None:
-        tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-        once = csr_matrix((np.ones(len(tail), dtype=np.int8), (tail, head)), shape=(n, n))
-        self.matrix = (once + once.T).tocsr()  # 1 on the boundary, 2 inside
-        self.start, self.indices = self.matrix.indptr[:-1], self.matrix.indices
-        self.degree = np.diff(self.matrix.indptr)
-        self.row = np.repeat(np.arange(n), self.degree)
+        tail, head = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+        forth, back = np.sort(n * tail + head), np.sort(n * head + tail)
+        if np.array_equal(forth, back):  # closed
+            keys, self.on_boundary = forth, np.zeros(len(forth), dtype=bool)
+        else:
+            keys, count = np.unique(np.concatenate([forth, back]), return_counts=True)
+            self.on_boundary = count == 1
+        self.row = keys // n
+        self.indices = keys - n * self.row
+        self.degree = np.bincount(self.row, minlength=n)
+        self.start = np.cumsum(self.degree) - self.degree
+
+    def common(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """How many neighbours vertices (N,) have in common with others (N,)."""
+        indptr = np.append(self.start, len(self.row))
+        shape = (len(self.start), len(self.start))
+        ones = csr_matrix((np.ones(len(self.row), dtype=np.int16), self.indices, indptr), shape)
+        return np.asarray(ones[one].multiply(ones[other]).sum(axis=1)).ravel()
 
     def least(self, value: np.ndarray) -> np.ndarray:
         """The least value (N,) over each vertex and its neighbours."""
@@ -141,7 +158,7 @@ def _collapses(
     """Vertices (N,) to collapse, their targets, and their other boundary neighbours or -1."""
     n = len(points)
     rings = Rings(faces, n)
-    row, column, on_boundary = rings.row, rings.indices, rings.matrix.data == 1
+    row, column, on_boundary = rings.row, rings.indices, rings.on_boundary
     boundary = np.bincount(row[on_boundary], minlength=n) > 0
     boundary_neighbours = np.bincount(row, weights=boundary[column], minlength=n)
     # inner vertices move onto the boundary only if that makes no chord; boundary ones stay on it
@@ -159,10 +176,7 @@ def _collapses(
     place = place[np.diff(row[place], prepend=-1) > 0]  # one for each vertex
     vertex, target = row[place], column[place]
 
-    ones = rings.matrix.copy()
-    ones.data = np.ones(len(row), dtype=np.int16)
-    common = np.asarray(ones[vertex].multiply(ones[target]).sum(axis=1)).ravel()
-    good = common == np.where(boundary[vertex], 1, 2)
+    good = rings.common(vertex, target) == np.where(boundary[vertex], 1, 2)
     good &= rings.degree[vertex] + rings.degree[target] - 4 <= _MOST_NEIGHBOURS
     vertex, target = vertex[good], target[good]
     into = np.full(n, -1)
@@ -207,6 +221,6 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Of vectors (3, ...), by coordinates."""
-    return np.stack(
+    return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )

@@ -123,7 +123,7 @@ class Quotient:
         with np.errstate(all="ignore"):
             power = 1 / (det * det)
             inner, outer = 2 * area * (1 + power), 2 * area * power / det * (j * j).sum(axis=(0, 1))
-            cofactor = np.stack([np.stack([j[1, 1], -j[1, 0]]), np.stack([-j[0, 1], j[0, 0]])])
+            cofactor = np.array([[j[1, 1], -j[1, 0]], [-j[0, 1], j[0, 0]]])
             by_j = inner * j - outer * cofactor
         gradient = self._by_corners(by_j[:, 0] * x + by_j[:, 1] * y, by_j[:, 1] * z)
         # J = U Σ Vᵀ; eigenmatrices U E Vᵀ with E = e11, e22, (e21 - e12)/√2, (e21 + e12)/√2
@@ -131,7 +131,7 @@ class Quotient:
         with np.errstate(all="ignore"):
             product, of_large, of_small = large * small, large * large, small * small
             cube, squares = product * product * product, of_large + of_small
-            values = np.stack(
+            values = np.array(
                 [
                     2 + 6 / (of_large * of_large),
                     2 + 6 / (of_small * of_small),
@@ -185,14 +185,14 @@ def _singular(
     (F,), and cosine and sine of Vᵀ."""
     e, f = 0.5 * (j[0, 0] + j[1, 1]), 0.5 * (j[0, 0] - j[1, 1])
     g, h = 0.5 * (j[1, 0] + j[0, 1]), 0.5 * (j[1, 0] - j[0, 1])
-    large = np.hypot(e, h) + np.hypot(f, g)
+    large = np.sqrt(e * e + h * h) + np.sqrt(f * f + g * g)
     one, other = np.arctan2(g, f), np.arctan2(h, e)
     left, right = 0.5 * (other + one), 0.5 * (other - one)
     return _turn(left), large, det / large, _turn(right)
 
 
 def _turn(angle: np.ndarray) -> np.ndarray:
-    return np.stack([np.cos(angle), np.sin(angle)])
+    return np.array([np.cos(angle), np.sin(angle)])
 
 
 def _first_flip(j: np.ndarray, change: np.ndarray) -> float:

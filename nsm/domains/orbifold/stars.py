@@ -32,7 +32,7 @@ def hats(
     longest = np.maximum(lu, np.sqrt((v * v).sum(axis=0)))
     double = np.maximum(double, flattest * longest**2)
     # the triangle (0, 0), (lu, 0), (along, double / lu)
-    return np.stack([1 / lu, -along / double, lu / double]), 0.5 * double
+    return np.array([1 / lu, -along / double, lu / double]), 0.5 * double
 
 
 def seen(lift: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ def seen(lift: np.ndarray) -> np.ndarray:
         that.
     """
     back = group.inverse(lift)
-    both = np.stack([group.compose(back, lift[:, turn]) for turn in ([1, 2, 0], [2, 0, 1])])
+    both = np.array([group.compose(back, lift[:, turn]) for turn in ([1, 2, 0], [2, 0, 1])])
     return both.reshape(2, -1, 3).transpose(0, 2, 1).astype(np.float64)
 
 
@@ -79,10 +79,10 @@ class Stars:
         self.vertex, self.corners, self.star = vertex, corners[order], star[order]
         self._start = np.searchsorted(self.star, np.arange(len(vertex)))
         face, k = self.corners // 3, self.corners % 3
-        self.ring = np.stack([faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]])
+        self.ring = np.array([faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]])
         (x, y, z), area = hats(vertices, np.stack([vertex[self.star], *self.ring], axis=1))
         w = y + z
-        self.shape = np.stack([(x * x + w * w) * area, -w * z * area, z * z * area, 0.5 / area])
+        self.shape = np.array([(x * x + w * w) * area, -w * z * area, z * z * area, 0.5 / area])
 
     @property
     def d(self) -> np.ndarray:
@@ -91,13 +91,26 @@ class Stars:
 
     def chosen(self, keep: np.ndarray) -> tuple[Stars, np.ndarray]:
         """Those of the stars that a mask (N,) keeps, and which of their corners (M,) these have."""
-        mine = np.flatnonzero(keep[self.star])
+        mine = np.flatnonzero(keep.take(self.star))
         new = object.__new__(Stars)
         new.vertex, new.corners = self.vertex[keep], self.corners[mine]
         new.star = (np.cumsum(keep) - 1)[self.star[mine]]
         new._start = np.searchsorted(new.star, np.arange(len(new.vertex)))
         new.ring, new.shape = self.ring.take(mine, axis=1), self.shape.take(mine, axis=1)
         return new, mine
+
+    def split(self, ends: np.ndarray) -> list[Stars]:
+        """The stars in parts, each up to one of the numbers."""
+        parts, start = [], 0
+        corner = np.append(self._start, len(self.corners))
+        for end in ends.tolist():
+            new, mine = object.__new__(Stars), slice(corner[start], corner[end])
+            new.vertex, new.corners = self.vertex[start:end], self.corners[mine]
+            new.star, new._start = self.star[mine] - start, self._start[start:end] - mine.start
+            new.ring, new.shape = self.ring[:, mine], self.shape[:, mine]
+            parts.append(new)
+            start = end
+        return parts
 
     def rings(self, seen: np.ndarray, uv: np.ndarray, lattice: np.ndarray) -> np.ndarray:
         """Places (2, 2, M) of b and c, by coordinates, each in the lift of the star's middle.
@@ -133,7 +146,7 @@ class Stars:
         loses its area before 1.25 times the step."""
         a, e, _, d = self.shape
         x, y = at.take(self.star, axis=1) - rings[0], rings[1] - rings[0]
-        n = np.stack([-y[1] * d, y[0] * d])
+        n = np.array([-y[1] * d, y[0] * d])
         det = n[0] * x[0] + n[1] * x[1]
         q = self._dirichlet(x, y)
         power = 1 / (det * det)
@@ -143,7 +156,7 @@ class Stars:
         mixed, second = first * qd, 6 * q * power * power * n
         round_ = 2 * a * one
         energy, gx, gy, xx, xy, yy = self.sums(
-            np.stack(
+            np.array(
                 [
                     q * one,
                     *(one * qd + first * q * n),
@@ -154,10 +167,10 @@ class Stars:
             )
         )
         # λ I is added where the lower eigenvalue is not clearly above zero
-        mean, radius = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+        mean, radius = 0.5 * (xx + yy), np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         shift = np.maximum(0.05 * (np.abs(mean) + radius) - (mean - radius), 0.0)
         xx, yy = xx + shift, yy + shift
-        step = np.stack([xy * gy - yy * gx, xy * gx - xx * gy]) / (xx * yy - xy * xy)
+        step = np.array([xy * gy - yy * gx, xy * gx - xx * gy]) / (xx * yy - xy * xy)
         change = -(n * step.take(self.star, axis=1)).sum(axis=0) / det
         rate = np.maximum.reduceat(change, self._start)
         step *= np.minimum(1.0, 0.8 / np.maximum(rate, 1e-300))

@@ -42,10 +42,8 @@ class Triangles:
         ids, local = topology.renumbered(self.faces, len(self.vertices))
         owner = local[self.faces.ravel()]
         colour = colours(owner.reshape(-1, 3), len(ids))
-        number, result = np.empty(len(ids), dtype=np.int64), []
-        for k in range(int(colour.max()) + 1):
-            corners, members = np.flatnonzero(colour[owner] == k), np.flatnonzero(colour == k)
-            number[members] = np.arange(len(members))
-            star = number[owner[corners]]
-            result.append(Stars(self.vertices, self.faces, ids[members], corners, star))
-        return result
+        order = np.argsort(colour, kind="stable")
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        every = Stars(self.vertices, self.faces, ids[order], np.arange(len(owner)), place[owner])
+        return every.split(np.cumsum(np.bincount(colour)))
