@@ -63,14 +63,16 @@ def coarsen(
     Returns:
         The faces (F, 3), where removed ones have two equal corners; and the rounds.
     """
-    faces, flat = faces.copy(), np.arange(3)
+    faces, flat, places = faces.copy(), np.arange(3), np.ascontiguousarray(vertices.T)
     alive = np.arange(len(faces))
     rng = np.random.default_rng(0)
     rounds: list[Round] = []
     while len(alive) > count:
         present = faces[alive]
         ids, local = topology.renumbered(present, len(vertices))
-        vertex, target, before = _collapses(vertices[ids], local[present], held[ids], rng)
+        vertex, target, before = _collapses(
+            places.take(ids, axis=1), local[present], held[ids], rng
+        )
         if len(vertex) < _LEAST_SHARE * len(ids):
             break
         number = np.full(len(vertices), -1)
@@ -155,8 +157,9 @@ class Rings:
 def _collapses(
     points: np.ndarray, faces: np.ndarray, held: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (N,) to collapse, their targets, and their other boundary neighbours or -1."""
-    n = len(points)
+    """Vertices (N,) of those at points (3, V) to collapse, their targets, and their other boundary
+    neighbours or -1."""
+    n = points.shape[1]
     rings = Rings(faces, n)
     row, column, on_boundary = rings.row, rings.indices, rings.on_boundary
     boundary = np.bincount(row[on_boundary], minlength=n) > 0
@@ -167,7 +170,7 @@ def _collapses(
     allowed &= ~held[row]
     if boundary.sum() <= _FEWEST_ON_BOUNDARY:
         allowed &= ~boundary[row]
-    side = points.T.take(row, axis=1) - points.T.take(column, axis=1)
+    side = points.take(row, axis=1) - points.take(column, axis=1)
     length = np.sqrt(_dot(side, side))
     # random costs: a collapse that fails in one round is tried differently in the next
     cost = np.where(allowed, length * rng.uniform(1.0, 1.7, len(row)), np.inf)
@@ -191,8 +194,9 @@ def _collapses(
 
 
 def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
-    """Mask (N,) of vertices that leave bad triangles if collapsed onto others, ``into``."""
-    result, points = np.zeros(len(points), dtype=bool), np.ascontiguousarray(points.T)
+    """Mask (V,) of vertices at points (3, V) that leave bad triangles if collapsed onto others,
+    ``into``."""
+    result = np.zeros(len(into), dtype=bool)
     corner = [points.take(faces[:, k], axis=1) for k in range(3)]
     sides = np.stack([corner[k - 1] - corner[k - 2] for k in range(3)], axis=1)  # opposite each
     normal = _cross(sides[:, 1], sides[:, 2])

@@ -57,7 +57,10 @@ class Effort:
 
 @dataclass
 class Layout:
-    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns."""
+    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns.
+
+    In memory, one coordinate of all vertices comes after the other: they are looked up so.
+    """
 
     lift: np.ndarray
     uv: np.ndarray
@@ -65,7 +68,7 @@ class Layout:
 
     def shaped(self, matrix: np.ndarray) -> None:
         """Apply a linear map (2, 2) to the plane."""
-        self.uv = self.uv @ matrix.T
+        self.uv = (matrix @ self.uv.T).T
         self.lattice = matrix @ self.lattice
 
 
@@ -113,7 +116,8 @@ class Levels:
     def __init__(
         self, vertices: np.ndarray, faces: np.ndarray, rounds: list[Round], area: float
     ) -> None:
-        self.vertices, self.faces, self.rounds, self.area = vertices, faces, rounds, area
+        self.vertices = np.asfortranarray(vertices)  # looked up by coordinates
+        self.faces, self.rounds, self.area = faces, rounds, area
 
     def __iter__(self) -> Iterator[Level]:
         # those of a small mesh are kept: more sets of cones may be tried on it
@@ -191,7 +195,7 @@ def laid_out(
     local[ids] = np.arange(len(ids))
     lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
 
-    small = Layout(lift[alive], np.zeros((len(ids), 2)), np.eye(2))
+    small = Layout(lift[alive], np.zeros((2, len(ids))).T, np.eye(2))
     of_cones = None if cones is None else local[cones]
     _first(levels.second, small, of_cones, weights)
     _undone(levels.second, small, held[ids], effort)
@@ -201,7 +205,7 @@ def laid_out(
     if cones is not None:
         x[of_cones], gauge[cones] = group.CONES, group.IDENTITY
     lift = group.compose(lift, group.inverse(gauge[_clusters(len(vertices), rounds)[faces]]))
-    layout = Layout(lift, np.zeros((len(vertices), 2)), small.lattice)
+    layout = Layout(lift, np.zeros((2, len(vertices))).T, small.lattice)
     layout.uv[ids] = x @ small.lattice.T
     _undone(levels.first, layout, held, effort)
     return layout

@@ -151,18 +151,14 @@ class Quotient:
         hessian = np.empty((2, 2, *aa.shape))
         hessian[0, 0] = (cc * one + ss * mean) * aa + (cc * mean + ss * two) * bb - cs * both
         hessian[1, 1] = (ss * one + cc * mean) * aa + (ss * mean + cc * two) * bb + cs * both
-        hessian[0, 1] = (
-            cs * ((one - mean) * aa + (mean - two) * bb) + half * ba - ss * both
-        )
+        hessian[0, 1] = cs * ((one - mean) * aa + (mean - two) * bb) + half * ba - ss * both
         hessian[1, 0] = hessian[0, 1].transpose(1, 0, 2)
         return gradient, hessian
 
     def _by_corners(self, second: np.ndarray, third: np.ndarray) -> np.ndarray:
         """Values (..., 3, F) at corners that add up to zero, by those (..., F) at two of them, with
         the signs of lifts."""
-        return np.stack(
-            [-second - third, self._sign[0] * second, self._sign[1] * third], axis=-2
-        )
+        return np.stack([-second - third, self._sign[0] * second, self._sign[1] * third], axis=-2)
 
 
 def _det(j: np.ndarray) -> np.ndarray:
