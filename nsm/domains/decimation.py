@@ -94,6 +94,18 @@ def undo(faces: np.ndarray, step: Round) -> None:
     faces.ravel()[step.corners] = step.vertex[step.star]
 
 
+def finer(faces: np.ndarray, rounds: list[Round], count: int) -> np.ndarray:
+    """The faces (F, 3) that :func:`coarsen` would have left for a larger count, by what it left for
+    a smaller one."""
+    for step in reversed(rounds):
+        before = faces.copy()
+        undo(before, step)
+        if len(present_faces(before)) > count:
+            break
+        faces = before
+    return faces
+
+
 def present_faces(faces: np.ndarray) -> np.ndarray:
     """Those of the faces (F, 3) that are not removed."""
     return faces[_has_area(faces)]
