@@ -345,7 +345,7 @@ def _put_back(level: Level, lifts: np.ndarray, layout: Layout) -> bool:
     own = lifts.take(stars.corners, axis=2)
     rings = stars.rings(own, uv, lattice)
     place = stars.sums((level.weights[:, None] * rings).sum(axis=0))
-    missing = _placed(uv, stars, rings, uv[level.target].T, place)
+    missing = _placed(uv, stars, stars.forms(rings), uv[level.target].T, place)
     for number in missing.tolist():
         b, c = rings[:, :, stars.star == number].transpose(0, 2, 1)
         at = innermost(b, c, _LEAST_ROOM)
@@ -358,7 +358,7 @@ def _put_back(level: Level, lifts: np.ndarray, layout: Layout) -> bool:
 
 
 def _placed(
-    uv: np.ndarray, stars: Stars, rings: np.ndarray, target: np.ndarray, place: np.ndarray
+    uv: np.ndarray, stars: Stars, forms: np.ndarray, target: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
     """Move each middle to its place (2, N), or as near to it from its target as it flips nothing;
     numbers of those that found no place."""
@@ -366,13 +366,13 @@ def _placed(
     for _ in range(_TRIES):
         trial = target + share * (place - target)
         with np.errstate(all="ignore"):
-            fits = np.isfinite(stars.energy(rings, trial))
+            fits = np.isfinite(stars.energy(forms, trial))
         uv[stars.vertex[fits]] = trial[:, fits].T
         if fits.all():
             return missing[:0]
         left = ~fits
         stars, corners = stars.chosen(left)
-        rings, target, place = rings.take(corners, axis=2), target[:, left], place[:, left]
+        forms, target, place = forms.take(corners, axis=1), target[:, left], place[:, left]
         missing = missing[left]
         share *= _NEARER
     return missing

@@ -121,57 +121,63 @@ class Stars:
         """
         return seen[:, :1] * uv.T.take(self.ring, axis=1).transpose(1, 0, 2) + lattice @ seen[:, 1:]
 
-    def energy(self, rings: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """Energy (N,) of each star with its middle at (2, N); inf where a triangle has no area."""
-        x, y = at.take(self.star, axis=1) - rings[0], rings[1] - rings[0]
-        det = (y[0] * x[1] - y[1] * x[0]) * self.shape[3]
-        good = det > 0
-        power = 1 / np.where(good, det, 1.0) ** 2
-        return self.sums(np.where(good, self._dirichlet(x, y) * (1 + power), np.inf))
+    def forms(self, rings: np.ndarray) -> np.ndarray:
+        """What the energies of triangles need of the places (2, 2, M) of b and c: (7, M), b itself,
+        the gradient n of det J by the middle's place p, and 2 e y and f |y|² with y = c - b: then
+        with x = p - b, det J is n·x and A ‖J‖² is a |x|² + 2 e x·y + f |y|²."""
+        y = rings[1] - rings[0]
+        _, e, f, d = self.shape
+        forms = np.empty((7, len(self.star)))
+        forms[:2] = rings[0]
+        forms[2], forms[3] = -y[1] * d, y[0] * d
+        forms[4:6] = 2 * e * y
+        forms[6] = f * (y[0] * y[0] + y[1] * y[1])
+        return forms
 
-    def _dirichlet(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        a, e, f, _ = self.shape
-        return (
-            a * (x[0] * x[0] + x[1] * x[1])
-            + 2 * e * (x[0] * y[0] + x[1] * y[1])
-            + f * (y[0] * y[0] + y[1] * y[1])
-        )
+    def energy(self, forms: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Energy (N,) of each star with its middle at (2, N); inf where a triangle has no area."""
+        det, norm, _ = self._jacobians(forms, at)
+        good = det > 0
+        det = np.where(good, det, 1.0)
+        return self.sums(np.where(good, norm * (1 + 1 / (det * det)), np.inf))
+
+    def _jacobians(
+        self, forms: np.ndarray, at: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """det J and A ‖J‖² (M,), and x (2, M)."""
+        x = at.take(self.star, axis=1) - forms[:2]
+        squares, mixed = x * x, forms[2:6].reshape(2, 2, -1) * x
+        square = self.shape[0] * (squares[0] + squares[1])
+        det, along = mixed[:, 0] + mixed[:, 1]
+        return det, square + along + forms[6], x
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Sums (..., N) over the corners of each star of values (..., M)."""
         return np.asarray(np.add.reduceat(values, self._start, axis=-1))
 
-    def newton(self, rings: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def newton(self, forms: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energy (N,) with the middles at (2, N), and Newton's steps (2, N), no triangle of which
         loses its area before 1.25 times the step."""
-        a, e, _, d = self.shape
-        x, y = at.take(self.star, axis=1) - rings[0], rings[1] - rings[0]
-        n = np.array([-y[1] * d, y[0] * d])
-        det = n[0] * x[0] + n[1] * x[1]
-        q = self._dirichlet(x, y)
+        det, q, x = self._jacobians(forms, at)
+        n, twice = forms[2:4], 2 * self.shape[0]
+        by_x = twice * x + forms[4:6]  # of q
         power = 1 / (det * det)
         one = 1 + power
         first = -2 * power / det
-        qd = 2 * (a * x + e * y)
-        mixed, second = first * qd, 6 * q * power * power * n
-        round_ = 2 * a * one
-        energy, gx, gy, xx, xy, yy = self.sums(
-            np.array(
-                [
-                    q * one,
-                    *(one * qd + first * q * n),
-                    round_ + (2 * mixed[0] + second[0]) * n[0],
-                    mixed[0] * n[1] + (mixed[1] + second[1]) * n[0],
-                    round_ + (2 * mixed[1] + second[1]) * n[1],
-                ]
-            )
-        )
+        mixed, second = first * by_x, 6 * q * power * power * n
+        parts = np.empty((6, len(det)))
+        parts[0] = q * one
+        parts[1:3] = one * by_x + first * q * n
+        parts[3:5] = twice * one + (2 * mixed + second) * n
+        parts[5] = mixed[0] * n[1] + (mixed[1] + second[1]) * n[0]
+        energy, gx, gy, xx, yy, xy = self.sums(parts)
         # λ I is added where the lower eigenvalue is not clearly above zero
-        mean, radius = 0.5 * (xx + yy), np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+        radius = np.sqrt(half * half + xy * xy)
         shift = np.maximum(0.05 * (np.abs(mean) + radius) - (mean - radius), 0.0)
         xx, yy = xx + shift, yy + shift
         step = np.array([xy * gy - yy * gx, xy * gx - xx * gy]) / (xx * yy - xy * xy)
-        change = -(n * step.take(self.star, axis=1)).sum(axis=0) / det
-        rate = np.maximum.reduceat(change, self._start)
+        change = n * step.take(self.star, axis=1)
+        rate = np.maximum.reduceat(-(change[0] + change[1]) / det, self._start)
         step *= np.minimum(1.0, 0.8 / np.maximum(rate, 1e-300))
         return energy, step

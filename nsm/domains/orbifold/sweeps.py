@@ -24,27 +24,27 @@ def relax(uv: np.ndarray, lattice: np.ndarray, stars: Stars, seen: np.ndarray) -
         uv, lattice: (V, 2) and (2, 2).
         stars, seen: as for :meth:`Stars.rings`.
     """
-    rings = stars.rings(seen, uv, lattice)
+    forms = stars.forms(stars.rings(seen, uv, lattice))
     here = uv[stars.vertex].T
     with np.errstate(all="ignore"):
-        energy, step = stars.newton(rings, here)
+        energy, step = stars.newton(forms, here)
     active = np.isfinite(step).all(axis=0)
     if not active.all():
         stars, corners = stars.chosen(active)
-        rings, here = rings.take(corners, axis=2), here[:, active]
+        forms, here = forms.take(corners, axis=1), here[:, active]
         energy, step = energy[active], step[:, active]
     for _ in range(_TRIES):
         if here.size == 0:
             return
         trial = here + step
-        better = stars.energy(rings, trial) < energy
+        better = stars.energy(forms, trial) < energy
         if better.all():
             uv[stars.vertex] = trial.T
             return
         uv[stars.vertex[better]] = trial[:, better].T
         left = ~better
         stars, corners = stars.chosen(left)
-        rings, here = rings.take(corners, axis=2), here[:, left]
+        forms, here = forms.take(corners, axis=1), here[:, left]
         energy, step = energy[left], _SHORTER * step[:, left]
 
 
