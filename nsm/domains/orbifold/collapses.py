@@ -43,18 +43,22 @@ def collapsed(
     def look(v: int) -> None:
         ring, at = beside[v], points[v]
         best.pop(v, None)
-        options = []
+        found: tuple[float, int] | None = None
         for w in ring:
             # the link condition, and no vertex with hardly any room around it
-            common = ring & beside[w]
-            if len(common) == 2 and len(ring) + len(beside[w]) >= 7:
-                if all(len(around[u]) > 3 for u in common):
-                    # vertices of high degree are hard to place again
-                    crowd = max(len(ring) + len(beside[w]) - 4, 6) / 6
-                    options.append((math.dist(at, points[w]) * crowd, w))
-        if options:
-            best[v] = cost, w = min(options)
-            heappush(queue, (cost, v, w))
+            common, size = ring & beside[w], len(ring) + len(beside[w])
+            if len(common) != 2 or size < 7:
+                continue
+            one, other = common
+            if len(around[one]) > 3 and len(around[other]) > 3:
+                # vertices of high degree are hard to place again
+                crowd = max(size - 4, 6) / 6
+                option = math.dist(at, points[w]) * crowd, w
+                if found is None or option < found:
+                    found = option
+        if found is not None:
+            best[v] = found
+            heappush(queue, (found[0], v, found[1]))
 
     for v in candidates:
         look(v)

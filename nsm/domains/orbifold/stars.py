@@ -47,7 +47,7 @@ def seen(lift: np.ndarray) -> np.ndarray:
     """
     back = group.inverse(lift)
     both = np.array([group.compose(back, lift[:, turn]) for turn in ([1, 2, 0], [2, 0, 1])])
-    return both.reshape(2, -1, 3).transpose(0, 2, 1).astype(np.float64)
+    return both.reshape(2, -1, 3).transpose(0, 2, 1).astype(np.float64, order="C")
 
 
 class Stars:
