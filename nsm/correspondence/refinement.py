@@ -155,8 +155,8 @@ class Batch:
         n = self.cells
         s, t = 0.5 * n * x, 0.5 * n * y
         i, j = torch.floor(s.detach()), torch.floor(t.detach())
-        cell = (torch.remainder(i, n) * n + torch.remainder(j, n)).long()
-        cell = cell + n * n * self.number[:, None]
+        row, column = torch.remainder(i.long(), n), torch.remainder(j.long(), n)
+        cell = n * (n * self.number[:, None] + row) + column
         rows = self.bilinear.index_select(0, cell.view(-1))
         one, by_u, by_v, by_uv = rows.T.contiguous().view(4, 3, *x.shape)
         u, v = s - i, t - j

@@ -143,8 +143,7 @@ class Quotient:
         one, two, skew, twist = values * area
         mean, half = 0.5 * (skew + twist), 0.5 * (twist - skew)
         # hat functions' gradients along the columns of V
-        a = self._by_corners((p * x - q * y)[None], (-q * z)[None])[0]
-        b = self._by_corners((q * x + p * y)[None], (p * z)[None])[0]
+        a, b = self._by_corners(p * x - q * y, -q * z), self._by_corners(q * x + p * y, p * z)
         aa, bb, ba = a[:, None] * a, b[:, None] * b, b[:, None] * a
         cc, ss, cs = c * c, s * s, c * s
         both = half * (ba + ba.transpose(1, 0, 2))
