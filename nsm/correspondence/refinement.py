@@ -92,12 +92,20 @@ class Batch:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=torch.float32)
 
-        self.basis = tensor(Sines.up_to(largest).basis(source.at))
-        self.at, self.area = tensor(source.at), tensor(source.area)
-        self.inverse = tensor(source.inverse)
-        self.inverse_determinant = torch.linalg.det(self.inverse)
-        self.log_metric = tensor(np.stack([t.log_metric for t in tables]))
-        self.number = torch.as_tensor(number)
+        # derivatives along an orthonormal frame of each triangle, the columns of L in G⁻¹ = L Lᵀ
+        frame = np.linalg.cholesky(source.inverse)
+        value, *along = Sines.up_to(largest).basis(source.at)
+        along = np.einsum("nij,ink->jnk", frame, np.stack(along))
+        self.basis = tensor(np.concatenate([value, *along]).T)  # (K, 3N)
+        at = np.einsum("hij,nj->ihn", matrices, source.at) + shifts.T[:, :, None]
+        affine = np.einsum("hij,njk->ihkn", matrices, frame)
+        self.affine = tensor(np.concatenate([at[:, :, None], affine], axis=2))  # (2, H, 3, N)
+        scale = np.linalg.det(frame)
+        self.scale = tensor(scale)
+        self.inverse_scale = tensor(np.linalg.det(matrices)[:, None] / scale)
+        self.area = tensor(source.area)
+        self.cells, self.number = len(tables[0].log_metric), torch.as_tensor(number)
+        self.bilinear = tensor(np.concatenate([_bilinear(t.log_metric) for t in tables]))
         self.matrices, self.shifts = tensor(matrices), tensor(shifts)
         self.anchors = anchors
         if anchors is not None:
@@ -124,36 +132,44 @@ class Batch:
 
     def energies(self, amplitudes: Tensor) -> Tensor:
         """Mean symmetric Dirichlet energy (H,) of maps with amplitudes (H, K, 2)."""
-        stack = torch.einsum("dnk,hkc->dhnc", self.basis[:, :, : amplitudes.shape[1]], amplitudes)
-        j = stack[1:].permute(1, 2, 3, 0) + torch.eye(2)  # (H, N, 2, 2): component, direction
-        h = self.at + stack[0]
-        image = torch.einsum("hij,hnj->hni", self.matrices, h) + self.shifts[:, None]
-        metric = _exponential(self._interpolated(self.log_metric, image))
-        whole = torch.einsum("hij,hnjk->hnik", self.matrices, j)
-        pulled = whole.mT @ metric @ whole
-        trace = torch.einsum("nij,hnij->hn", self.inverse, pulled)
-        det = j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0]
+        # by coordinates: products of small matrices, one by one, would take most of the time
+        maps, waves, _ = amplitudes.shape
+        moved = (amplitudes @ self.matrices.mT).permute(2, 0, 1).reshape(2 * maps, waves)
+        h = self.affine + (moved @ self.basis[:waves]).view(2, maps, 3, -1)
+        (x, a, b), (y, c, d) = (one.unbind(dim=1) for one in h)
+        m, p, q = self._log_metrics(x, y)
+        size, even, odd = _exponential(m, p, q)
+        first, second = a * a + b * b, c * c + d * d
+        trace = even * (first + second) + odd * (p * (first - second) + 2 * q * (a * c + b * d))
+        det = (a * d - b * c) * self.inverse_scale
         low = _LEAST_DETERMINANT
         det = torch.where(det > low, det, low * torch.exp((det / low - 1).clamp(max=0.0)))
-        det = det**2 * torch.linalg.det(metric) * self.inverse_determinant
+        det = (det * size * self.scale) ** 2
         energy = trace + (trace + 2 * _EPSILON) / (det + _EPSILON * trace + _EPSILON**2)
         large = energy > _CAPPED
         energy = torch.where(large, _CAPPED * (1 + torch.log(energy / _CAPPED)), energy)
         return energy @ self.area
 
-    def _interpolated(self, grid: Tensor, points: Tensor) -> Tensor:
-        """Values (H, N, 3) of tables (T, C, C, 3) at points (H, N, 2), bilinear."""
-        n = grid.shape[1]
-        t = 0.5 * n * points
-        cell = torch.floor(t.detach())
-        f = (t - cell)[..., None, :]
-        i, j = torch.remainder(cell.long(), n).unbind(dim=-1)
-        k, m = (i + 1) % n, (j + 1) % n
-        number = self.number[:, None]
-        u, v = f[..., 0], f[..., 1]
-        near = (1 - v) * grid[number, i, j] + v * grid[number, i, m]
-        far = (1 - v) * grid[number, k, j] + v * grid[number, k, m]
-        return (1 - u) * near + u * far
+    def _log_metrics(self, x: Tensor, y: Tensor) -> Tensor:
+        """(m, a, b) (3, H, N) of the targets' tables at points (H, N), bilinear."""
+        n = self.cells
+        s, t = 0.5 * n * x, 0.5 * n * y
+        i, j = torch.floor(s.detach()), torch.floor(t.detach())
+        row, column = torch.remainder(i.long(), n), torch.remainder(j.long(), n)
+        cell = n * (n * self.number[:, None] + row) + column
+        rows = self.bilinear.index_select(0, cell.view(-1))
+        one, by_u, by_v, by_uv = rows.T.contiguous().view(4, 3, *x.shape)
+        u, v = s - i, t - j
+        return one + u * by_u + v * (by_v + u * by_uv)
+
+
+def _bilinear(grid: np.ndarray) -> np.ndarray:
+    """Coefficients (N², 12) of 1, u, v and uv for the cells of a periodic grid (N, N, 3)."""
+    far, right = np.roll(grid, -1, axis=0), np.roll(grid, -1, axis=1)
+    both = np.roll(far, -1, axis=1)
+    return np.concatenate(
+        [grid, far - grid, right - grid, both - far - right + grid], axis=2
+    ).reshape(-1, 12)
 
 
 def refined(batch: Batch, amplitudes: Tensor, steps: int) -> tuple[Tensor, Tensor]:
@@ -215,11 +231,9 @@ def _direction(gradient: Tensor, moves: list[Tensor], changes: list[Tensor]) -> 
     return -q
 
 
-def _exponential(log: Tensor) -> Tensor:
-    """The matrices (..., 2, 2) with the logarithms m I + ((a, b), (b, -a)), given as (m, a, b)."""
-    m, a, b = log.unbind(dim=-1)
-    r = torch.sqrt(a**2 + b**2 + 1e-12)
+def _exponential(m: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The exponential of m I + ((a, b), (b, -a)): the root of its determinant, and the factors of I
+    and of ((a, b), (b, -a))."""
+    r = torch.sqrt(a * a + b * b + 1e-12)
     size = torch.exp(m)
-    even, odd = size * torch.cosh(r), size * torch.sinh(r) / r
-    first = torch.stack([even + odd * a, odd * b], dim=-1)
-    return torch.stack([first, torch.stack([odd * b, even - odd * a], dim=-1)], dim=-2)
+    return size, size * torch.cosh(r), size * torch.sinh(r) / r

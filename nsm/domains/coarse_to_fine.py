@@ -8,7 +8,7 @@ mesh, not with the fill of a factorised matrix.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -83,7 +83,7 @@ def _reinsert(
     stars = Stars.of(vertices, step.vertex, step.star, b, c)
     inner = step.before < 0
     place = np.empty((len(step.vertex), 2))
-    place[inner] = mean_values(vertices, stars, uv[stars.b], uv[stars.c])[inner]
+    place[inner] = _mean_values(vertices, uv, stars)[inner]
     place[~inner] = _between(vertices, uv, step, ~inner)
     fits = _placed(uv, stars, step, place, freedom)
     # near the target there is always room, though not in every direction
@@ -137,29 +137,36 @@ def _inwards(uv: np.ndarray, stars: Stars, step: Round, place: np.ndarray) -> np
     return np.where(step.before[:, None] < 0, at + distance[:, None] * left, place)
 
 
-def mean_values(vertices: np.ndarray, stars: Any, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The mean (N, 2) of each star's ring with mean value weights (Floater 2003).
+def mean_value_weights(
+    vertices: np.ndarray, middle: np.ndarray, ring: np.ndarray, d: np.ndarray
+) -> np.ndarray:
+    """Mean value weights (2, M) of both ends of each triangle's side in the mean of a ring (Floater
+    2003); they do not add up to one.
 
     Args:
         vertices: (V, 3).
-        stars: N vertices with their triangles: ``vertex``, ``star``, ``b``, ``c`` and ``d``, as of
-            :class:`nsm.domains.vertex_relaxation.Stars`.
-        b, c: places (M, 2) of the triangles' other two corners.
+        middle: (M,) vertex within the ring.
+        ring: (2, M) the triangle's other vertices.
+        d: (M,) one over twice its area.
     """
-    p = vertices[stars.vertex[stars.star]]
-    to_b, to_c = vertices[stars.b] - p, vertices[stars.c] - p
-    lb, lc = (np.maximum(np.linalg.norm(e, axis=1), 1e-12) for e in (to_b, to_c))
-    # tan of half the angle at p; 1 / d is twice the area
-    half = (1 / stars.d) / (lb * lc + (to_b * to_c).sum(axis=1)).clip(1e-300)
-    half = half.clip(1e-6, 1e6)
+    p = vertices[middle]
+    to_b, to_c = vertices[ring[0]] - p, vertices[ring[1]] - p
+    lb, lc = (np.maximum(np.sqrt((e * e).sum(axis=1)), 1e-12) for e in (to_b, to_c))
+    # tan of half the angle at p
+    half = (1 / d) / (lb * lc + (to_b * to_c).sum(axis=1)).clip(1e-300)
+    return half.clip(1e-6, 1e6) / np.stack([lb, lc])
+
+
+def _mean_values(vertices: np.ndarray, uv: np.ndarray, stars: Stars) -> np.ndarray:
+    """The mean (N, 2) of each star's ring with mean value weights."""
+    weights = mean_value_weights(
+        vertices, stars.vertex[stars.star], np.stack([stars.b, stars.c]), stars.d
+    )
+    b, c = weights[:, :, None] * [uv[stars.b], uv[stars.c]]
+    parts = np.concatenate([b + c, weights.sum(axis=0)[:, None]], axis=1)
     n = len(stars.vertex)
-
-    def total(of_b: np.ndarray, of_c: np.ndarray) -> np.ndarray:
-        return np.bincount(stars.star, weights=half * (of_b / lb + of_c / lc), minlength=n)
-
-    ones = np.ones(len(lb))
-    weight = total(ones, ones)
-    return np.stack([total(b[:, i], c[:, i]) / weight for i in range(2)], axis=1)
+    x, y, weight = (np.bincount(stars.star, weights=part, minlength=n) for part in parts.T)
+    return np.stack([x / weight, y / weight], axis=1)
 
 
 def _between(vertices: np.ndarray, uv: np.ndarray, step: Round, which: np.ndarray) -> np.ndarray:

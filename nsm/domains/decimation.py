@@ -63,14 +63,16 @@ def coarsen(
     Returns:
         The faces (F, 3), where removed ones have two equal corners; and the rounds.
     """
-    faces, flat = faces.copy(), np.arange(3)
+    faces, flat, places = faces.copy(), np.arange(3), np.ascontiguousarray(vertices.T)
     alive = np.arange(len(faces))
     rng = np.random.default_rng(0)
     rounds: list[Round] = []
     while len(alive) > count:
         present = faces[alive]
         ids, local = topology.renumbered(present, len(vertices))
-        vertex, target, before = _collapses(vertices[ids], local[present], held[ids], rng)
+        vertex, target, before = _collapses(
+            places.take(ids, axis=1), local[present], held[ids], rng
+        )
         if len(vertex) < _LEAST_SHARE * len(ids):
             break
         number = np.full(len(vertices), -1)
@@ -92,6 +94,18 @@ def undo(faces: np.ndarray, step: Round) -> None:
     faces.ravel()[step.corners] = step.vertex[step.star]
 
 
+def finer(faces: np.ndarray, rounds: list[Round], count: int) -> np.ndarray:
+    """The faces (F, 3) that :func:`coarsen` would have left for a larger count, by what it left for
+    a smaller one."""
+    for step in reversed(rounds):
+        before = faces.copy()
+        undo(before, step)
+        if len(present_faces(before)) > count:
+            break
+        faces = before
+    return faces
+
+
 def present_faces(faces: np.ndarray) -> np.ndarray:
     """Those of the faces (F, 3) that are not removed."""
     return faces[_has_area(faces)]
@@ -103,19 +117,36 @@ def _has_area(faces: np.ndarray) -> np.ndarray:
 
 
 class Rings:
-    """The neighbours of each of n vertices, all in faces: indices[start[v] : start[v + 1]]."""
+    """The neighbours of each of n vertices, all in faces: indices[start[v] : start[v + 1]].
+
+    Attributes:
+        row: the vertex whose neighbours indices are.
+        on_boundary: mask of the edges to them that have one face.
+    """
 
     def __init__(self, faces: np.ndarray, n: int) -> None:
-        tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-        once = csr_matrix((np.ones(len(tail), dtype=np.int8), (tail, head)), shape=(n, n))
-        self.matrix = (once + once.T).tocsr()  # 1 on the boundary, 2 inside
-        self.start, self.indices = self.matrix.indptr[:-1], self.matrix.indices
-        self.degree = np.diff(self.matrix.indptr)
-        self.row = np.repeat(np.arange(n), self.degree)
+        tail, head = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+        forth, back = np.sort(n * tail + head), np.sort(n * head + tail)
+        if np.array_equal(forth, back):  # closed
+            keys, self.on_boundary = forth, np.zeros(len(forth), dtype=bool)
+        else:
+            keys, count = np.unique(np.concatenate([forth, back]), return_counts=True)
+            self.on_boundary = count == 1
+        self.row = keys // n
+        self.indices = keys - n * self.row
+        self.degree = np.bincount(self.row, minlength=n)
+        self.start = np.cumsum(self.degree) - self.degree
+
+    def common(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """How many neighbours vertices (N,) have in common with others (N,)."""
+        indptr = np.append(self.start, len(self.row))
+        shape = (len(self.start), len(self.start))
+        ones = csr_matrix((np.ones(len(self.row), dtype=np.int16), self.indices, indptr), shape)
+        return np.asarray(ones[one].multiply(ones[other]).sum(axis=1)).ravel()
 
     def least(self, value: np.ndarray) -> np.ndarray:
         """The least value (N,) over each vertex and its neighbours."""
-        return np.minimum(value, np.minimum.reduceat(value[self.indices], self.start))
+        return np.minimum(value, np.minimum.reduceat(value.take(self.indices), self.start))
 
     def apart(self, priority: np.ndarray, distance: int) -> np.ndarray:
         """Mask (N,) of vertices more than ``distance`` (1 or 2) edges apart.
@@ -128,20 +159,21 @@ class Rings:
             for _ in range(distance):
                 lowest = self.least(lowest)
             chosen |= np.isfinite(priority) & (priority == lowest)
-            near = np.where(chosen, -1.0, 0.0)
+            near = chosen.copy()
             for _ in range(distance):
-                near = self.least(near)
-            priority[near < 0] = np.inf
+                near[self.indices[near[self.row]]] = True
+            priority[near] = np.inf
         return chosen
 
 
 def _collapses(
     points: np.ndarray, faces: np.ndarray, held: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (N,) to collapse, their targets, and their other boundary neighbours or -1."""
-    n = len(points)
+    """Vertices (N,) of those at points (3, V) to collapse, their targets, and their other boundary
+    neighbours or -1."""
+    n = points.shape[1]
     rings = Rings(faces, n)
-    row, column, on_boundary = rings.row, rings.indices, rings.matrix.data == 1
+    row, column, on_boundary = rings.row, rings.indices, rings.on_boundary
     boundary = np.bincount(row[on_boundary], minlength=n) > 0
     boundary_neighbours = np.bincount(row, weights=boundary[column], minlength=n)
     # inner vertices move onto the boundary only if that makes no chord; boundary ones stay on it
@@ -150,18 +182,16 @@ def _collapses(
     allowed &= ~held[row]
     if boundary.sum() <= _FEWEST_ON_BOUNDARY:
         allowed &= ~boundary[row]
-    length = np.linalg.norm(points[row] - points[column], axis=1)
+    side = points.take(row, axis=1) - points.take(column, axis=1)
+    length = np.sqrt(_dot(side, side))
     # random costs: a collapse that fails in one round is tried differently in the next
     cost = np.where(allowed, length * rng.uniform(1.0, 1.7, len(row)), np.inf)
     least = np.minimum.reduceat(cost, rings.start)
     place = np.flatnonzero(np.isfinite(cost) & (cost == least[row]))
-    vertex, first = np.unique(row[place], return_index=True)
-    target = column[place[first]]
+    place = place[np.diff(row[place], prepend=-1) > 0]  # one for each vertex
+    vertex, target = row[place], column[place]
 
-    ones = rings.matrix.copy()
-    ones.data = np.ones(len(row), dtype=np.int16)
-    common = np.asarray(ones[vertex].multiply(ones[target]).sum(axis=1)).ravel()
-    good = common == np.where(boundary[vertex], 1, 2)
+    good = rings.common(vertex, target) == np.where(boundary[vertex], 1, 2)
     good &= rings.degree[vertex] + rings.degree[target] - 4 <= _MOST_NEIGHBOURS
     vertex, target = vertex[good], target[good]
     into = np.full(n, -1)
@@ -176,20 +206,37 @@ def _collapses(
 
 
 def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
-    """Mask (N,) of vertices that leave bad triangles if collapsed onto others, ``into``."""
-    result = np.zeros(len(points), dtype=bool)
+    """Mask (V,) of vertices at points (3, V) that leave bad triangles if collapsed onto others,
+    ``into``."""
+    result = np.zeros(len(into), dtype=bool)
+    corner = [points.take(faces[:, k], axis=1) for k in range(3)]
+    sides = np.stack([corner[k - 1] - corner[k - 2] for k in range(3)], axis=1)  # opposite each
+    normal = _cross(sides[:, 1], sides[:, 2])
+    double = np.sqrt(_dot(normal, normal))
+    squares = _dot(sides, sides)
+    shape = double / squares.sum(axis=0)
     for k in range(3):
-        v, b, c = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        w = into[v]
-        kept = (w >= 0) & (w != b) & (w != c)
-        v, w, b, c = (points[i[kept]] for i in (v, w, b, c))
-        old, new = np.cross(b - v, c - v), np.cross(b - w, c - w)
-        double = np.linalg.norm(new, axis=1)
-        before = np.linalg.norm(old, axis=1)
-        side = ((b - c) ** 2).sum(axis=1)
-        shape = double / (side + ((b - w) ** 2).sum(axis=1) + ((c - w) ** 2).sum(axis=1))
-        shape_before = before / (side + ((b - v) ** 2).sum(axis=1) + ((c - v) ** 2).sum(axis=1))
-        bad = (old * new).sum(axis=1) < _TURN * double * before
-        bad |= shape < np.minimum(_SHAPE, shape_before)
-        result[faces[kept, k][bad]] = True
+        v, b, c = faces[:, k], faces[:, k - 2], faces[:, k - 1]
+        w = into.take(v)
+        kept = np.flatnonzero((w >= 0) & (w != b) & (w != c))
+        to = points.take(w[kept], axis=1)
+        to_b, to_c = corner[k - 2].take(kept, axis=1) - to, corner[k - 1].take(kept, axis=1) - to
+        new = _cross(to_b, to_c)
+        new_double = np.sqrt(_dot(new, new))
+        new_shape = new_double / (squares[k][kept] + _dot(to_b, to_b) + _dot(to_c, to_c))
+        bad = _dot(normal.take(kept, axis=1), new) < _TURN * new_double * double[kept]
+        bad |= new_shape < np.minimum(_SHAPE, shape[kept])
+        result[v[kept[bad]]] = True
     return result
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of vectors (3, ...), by coordinates."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of vectors (3, ...), by coordinates."""
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -10,13 +11,13 @@ import numpy as np
 def innermost(b: np.ndarray, c: np.ndarray, room: float = 1e-14) -> np.ndarray | None:
     """The point (2,) that sees all sides (K, 2) to (K, 2) of a ring, counter-clockwise, at the
     largest distance from the nearest; None if there is none with at least so much room."""
-    middle, size = b.mean(axis=0), max(float(np.ptp(b, axis=0).max()), 1e-300)
+    middle = b.mean(axis=0)
+    size = max(float((b.max(axis=0) - b.min(axis=0)).max()), 1e-300)
     b, side = (b - middle) / size, (c - b) / size
-    normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
-    length = np.linalg.norm(normal, axis=1).clip(1e-300)
-    normal /= length[:, None]
+    length = np.maximum(np.sqrt((side * side).sum(axis=1)), 1e-300)
+    normal = np.array([-side[:, 1], side[:, 0]]).T / length[:, None]
     # n_k p - r >= h_k: the best r is met with equality by three of the sides
-    three = np.array(list(combinations(range(len(b)), 3)))
+    three = _threes(len(b))
     system = np.concatenate([normal, np.full((len(b), 1), -1.0)], axis=1)[three]
     height = (normal * b).sum(axis=1)
     good = np.abs(np.linalg.det(system)) > 1e-12
@@ -29,3 +30,9 @@ def innermost(b: np.ndarray, c: np.ndarray, room: float = 1e-14) -> np.ndarray |
     if not radius[best] * size >= room:
         return None
     return np.asarray(middle + size * found[best, :2])
+
+
+@cache
+def _threes(count: int) -> np.ndarray:
+    """All sets (N, 3) of three of so many numbers."""
+    return np.array(list(combinations(range(count), 3)))

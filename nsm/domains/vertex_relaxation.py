@@ -15,14 +15,12 @@ import numpy as np
 from nsm.domains.decimation import Rings
 from nsm.domains.planar_mesh import cross, symmetric_dirichlet
 from nsm.surfaces import topology
-from nsm.surfaces.recent import Recent, content
 
 if TYPE_CHECKING:
     from nsm.domains.base import BoundedDomain
 
 _TRIES, _SHORTER = 4, 0.35
 _COLOURS = 64
-_COLOURED = Recent(2**20)
 
 
 @dataclass
@@ -219,12 +217,7 @@ def sweep(
 
 
 def colours(faces: np.ndarray, n: int) -> np.ndarray:
-    """Numbers (N,) that differ between neighbours; those of the latest meshes are remembered, as
-    one mesh is laid out many times to choose cones."""
-    return _COLOURED.get((n, content(faces)), lambda: _coloured(faces, n))
-
-
-def _coloured(faces: np.ndarray, n: int) -> np.ndarray:
+    """Numbers (N,) that differ between neighbours."""
     rings, rng = Rings(faces, n), np.random.default_rng(0)
     colour = np.full(n, -1)
     for k in range(_COLOURS):

@@ -73,8 +73,10 @@ def test_derivatives_of_the_sines():
 @examples(30)
 def test_exponentials_and_logarithms(m, a, b):
     matrix = expm(np.array([[m + a, b], [b, m - a]]))
-    made = _exponential(torch.tensor([[m, a, b]], dtype=torch.float64))[0].numpy()
+    size, even, odd = (f.item() for f in _exponential(*torch.tensor([m, a, b]).double()))
+    made = even * np.eye(2) + odd * np.array([[a, b], [b, -a]])
     assert made == pytest.approx(matrix, rel=1e-6)
+    assert size**2 == pytest.approx(np.linalg.det(matrix))
     assert _logarithm(matrix[None])[0] == pytest.approx([m, a, b], abs=1e-9)
 
 

@@ -7,6 +7,7 @@ bent mesh. What remains here is a handful: no limb is left that an embedding cou
 from __future__ import annotations
 
 import math
+from heapq import heappop, heappush
 
 import numpy as np
 
@@ -37,29 +38,37 @@ def collapsed(
     left = len(faces)
     candidates = {int(v) for v in np.unique(faces)} - set(np.flatnonzero(held).tolist())
     best: dict[int, tuple[float, int]] = {}
+    queue: list[tuple[float, int, int]] = []  # with some that are no more the best
 
     def look(v: int) -> None:
         ring, at = beside[v], points[v]
         best.pop(v, None)
-        options = []
+        found: tuple[float, int] | None = None
         for w in ring:
             # the link condition, and no vertex with hardly any room around it
-            common = ring & beside[w]
-            if len(common) == 2 and len(ring) + len(beside[w]) >= 7:
-                if all(len(around[u]) > 3 for u in common):
-                    # vertices of high degree are hard to place again
-                    crowd = max(len(ring) + len(beside[w]) - 4, 6) / 6
-                    options.append((math.dist(at, points[w]) * crowd, w))
-        if options:
-            best[v] = min(options)
+            common, size = ring & beside[w], len(ring) + len(beside[w])
+            if len(common) != 2 or size < 7:
+                continue
+            one, other = common
+            if len(around[one]) > 3 and len(around[other]) > 3:
+                # vertices of high degree are hard to place again
+                crowd = max(size - 4, 6) / 6
+                option = math.dist(at, points[w]) * crowd, w
+                if found is None or option < found:
+                    found = option
+        if found is not None:
+            best[v] = found
+            heappush(queue, (found[0], v, found[1]))
 
     for v in candidates:
         look(v)
     steps: list[list[tuple[int, int, list[int]]]] = []
     last = np.zeros(len(vertices), dtype=np.int64)  # how many rounds touched a vertex or its ring
     while left > count and best:
-        v = min(best, key=lambda u: (best[u][0], u))
-        w = best.pop(v)[1]
+        cost, v, w = heappop(queue)
+        if best.get(v) != (cost, w):
+            continue
+        del best[v]
         corners = [3 * f + faces[f].tolist().index(v) for f in sorted(around[v])]
         # into the first round after all that touched its ring
         touched = [v, *beside[v]]

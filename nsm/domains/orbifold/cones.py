@@ -8,9 +8,9 @@ from itertools import combinations
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from nsm.domains.decimation import coarsen, present_faces
+from nsm.domains.decimation import coarsen, finer, present_faces
 from nsm.domains.orbifold.lifts import cone_lifts
-from nsm.domains.orbifold.multiresolution import Effort, Hierarchy, hierarchy, laid_out
+from nsm.domains.orbifold.multiresolution import AREA, Effort, Hierarchy, hierarchy, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.errors import NsmError
 from nsm.stages import counted
@@ -37,12 +37,22 @@ def decimated(
     vertices: np.ndarray, faces: np.ndarray, count: int, held: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """About ``count`` faces (F', 3) of a coarser mesh, and the vertices (V',) that it keeps."""
-    mask = np.zeros(len(vertices), dtype=bool)
-    if held is not None:
-        mask[held] = True
-    coarse = present_faces(coarsen(vertices, faces, mask, count)[0])
-    ids, local = topology.renumbered(coarse, len(vertices))
-    return local[coarse], ids
+    return _without_gaps(coarsen(vertices, faces, _mask(len(vertices), held), count)[0])
+
+
+def _mask(count: int, ids: np.ndarray | None) -> np.ndarray:
+    """That (count,) of some vertices, or of none."""
+    mask = np.zeros(count, dtype=bool)
+    if ids is not None:
+        mask[ids] = True
+    return mask
+
+
+def _without_gaps(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces (F', 3) without those that are gone, in new numbers, and the vertices (V',) left."""
+    present = present_faces(faces)
+    ids, local = topology.renumbered(present, int(present.max()) + 1)
+    return local[present], ids
 
 
 def extremities(vertices: np.ndarray, faces: np.ndarray, count: int = _EXTREMITIES) -> np.ndarray:
@@ -162,10 +172,17 @@ def compared(
     """
     found: list[tuple[float, np.ndarray, list[np.ndarray]]] = []
     in_turn = [(_FEWEST, _QUICKEST), (_FACES, _LONGER)]
-    for count, effort in in_turn if again and len(sets) > 1 else [(_FEW, _QUICK)]:
+    if not again or len(sets) < 2:
+        in_turn = [(_FEW, _QUICK)]
+    fewest = in_turn[0][0]  # a mesh that is drawn together to so many faces was one of more before
+    coarse = [
+        coarsen(vertices, faces, _mask(len(vertices), ids), fewest)
+        for (vertices, faces), ids in zip(meshes, candidates, strict=True)
+    ]
+    for count, effort in in_turn:
         each = [
-            _Candidates(*mesh, ids, count, effort)
-            for mesh, ids in zip(meshes, candidates, strict=True)
+            _Candidates(vertices, finer(*drawn, count), ids, effort)
+            for (vertices, _), drawn, ids in zip(meshes, coarse, candidates, strict=True)
         ]
         found = _best(each, sets, _FINALISTS if again else 1)
         sets = [four for _, four, _ in found[:_FINALISTS]]
@@ -195,23 +212,17 @@ def _best(
 
 
 class _Candidates:
-    """Candidates for cones (K,) of a mesh (V, 3), (F, 3) that is drawn together to ``count`` faces
-    once, for all sets of them."""
+    """Candidates for cones (K,) of a coarse mesh (V, 3), (F, 3), where faces that are gone have two
+    equal corners; it is drawn together further once, for all sets of them."""
 
     def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        candidates: np.ndarray,
-        count: int,
-        effort: Effort,
+        self, vertices: np.ndarray, faces: np.ndarray, candidates: np.ndarray, effort: Effort
     ) -> None:
-        self.faces, ids = decimated(vertices, faces, count, candidates)
+        self.faces, ids = _without_gaps(faces)
         self.vertices, self.effort = vertices[ids], effort
         self.candidates = np.searchsorted(ids, candidates)
-        held = np.zeros(len(ids), dtype=bool)
-        held[self.candidates] = True
-        self.levels = hierarchy(self.vertices, self.faces, held, effort)
+        held = _mask(len(ids), self.candidates)
+        self.levels = hierarchy(self.vertices, self.faces, held, effort, AREA[True])
 
     def score(self, four: np.ndarray) -> tuple[float, np.ndarray]:
         """As :func:`score`, with the cones at four candidates; infinite if there is no layout."""

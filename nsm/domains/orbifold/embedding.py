@@ -11,7 +11,7 @@ import numpy as np
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.certificate import Certificate, certificate
 from nsm.domains.orbifold.cones import choose_cones
-from nsm.domains.orbifold.lifts import cone_lifts, torus_lifts
+from nsm.domains.orbifold.lifts import check_sphere, cone_lifts, torus_lifts
 from nsm.domains.orbifold.multiresolution import Effort, laid_out
 from nsm.domains.orbifold.newton import distortions
 from nsm.domains.orbifold.tutte import upright
@@ -138,7 +138,7 @@ def embed_orbifold(
     log: list[str] = []
     keep_order = cones is not None if keep_order is None else keep_order
     if cones is None:
-        cone_lifts(vertices, faces, np.unique(faces)[:4].tolist())  # is it a sphere at all?
+        check_sphere(faces)
         chosen, table = choose_cones(vertices, faces)
         cones = chosen.tolist()
         log += [f"cones {list(four)}: mean log distortion {value:.3f}" for value, four in table]

@@ -130,17 +130,20 @@ def torus_lifts(faces: np.ndarray) -> np.ndarray:
     return lift
 
 
-def _checked_cones(vertices: np.ndarray, faces: np.ndarray, cones: Sequence[int]) -> list[int]:
+def check_sphere(faces: np.ndarray) -> None:
+    """Raise ``wrong_topology`` unless a mesh (F, 3) is one closed surface of genus 0."""
     edges = topology.edges_of(faces)
-    closed = bool((edges.count == 2).all())
-    if (
-        not closed
-        or topology.euler_characteristic(faces) != 2
-        or topology.face_components(faces).max()
-    ):
+    used = np.zeros(int(faces.max()) + 1, dtype=bool)
+    used[faces] = True
+    euler = int(used.sum()) - len(edges.pairs) + len(faces)
+    if euler != 2 or (edges.count != 2).any() or topology.face_components(faces).max():
         raise NsmError(
             "the mesh is not a closed surface of genus 0; use another domain", kind="wrong_topology"
         )
+
+
+def _checked_cones(vertices: np.ndarray, faces: np.ndarray, cones: Sequence[int]) -> list[int]:
+    check_sphere(faces)
     corners = [int(v) for v in cones]
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -158,13 +161,14 @@ class _Split:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.points, self.faces, self.original = vertices, faces, faces
         self.parent = np.arange(len(faces))
+        self.edges = topology.edges_of(faces)
 
     def split_chords(self, away: set[int], path: list[int]) -> None:
         """Split the edges that join two vertices of ``away``, except those of the path.
 
         Then paths that keep off these vertices exist: what is left of the sphere is connected.
         """
-        edges = topology.edges_of(self.faces)
+        edges = self.edges
         inside = np.zeros(len(self.points), dtype=bool)
         inside[list(away)] = True
         chord = inside[edges.pairs].all(axis=1)
@@ -186,10 +190,11 @@ class _Split:
             parent += [self.parent[f]] * len(pieces)
         self.faces = np.concatenate([self.faces[~touched], np.array(new, dtype=np.int64)])
         self.parent = np.concatenate([self.parent[~touched], np.array(parent, dtype=np.int64)])
+        self.edges = topology.edges_of(self.faces)
 
     def shortest(self, start: int, goal: int, away: set[int]) -> list[int]:
         """Vertices of the shortest path between two that meets no vertex of ``away`` between."""
-        pairs = topology.edges_of(self.faces).pairs
+        pairs = self.edges.pairs
         barred = np.zeros(len(self.points), dtype=bool)
         barred[list(away - {start, goal})] = True
         open_ = ~barred[pairs].any(axis=1)
@@ -225,10 +230,9 @@ def _pieces(corner: list[int], mid: list[int]) -> list[tuple[int, int, int]]:
 
 def _fine_lifts(mesh: _Split, path: list[int], ends: list[int]) -> np.ndarray:
     """Lifts (F', 3, 3) of the split mesh, cut open along the path."""
-    edges = topology.edges_of(mesh.faces)
     n = len(mesh.points)
     steps = np.sort(np.stack([path[:-1], path[1:]], axis=1), axis=1)
-    is_cut = np.isin(edges.pairs @ [n, 1], steps @ [n, 1])
+    is_cut = np.isin(mesh.edges.pairs @ [n, 1], steps @ [n, 1])
     faces, origin = topology.cut_along(mesh.faces, is_cut)
     loop = topology.boundary_loops(faces)[0]
     loop = np.roll(loop, -int(np.flatnonzero(origin[loop] == path[0])[0]))

@@ -7,17 +7,21 @@ no descent comes back from there. On a few hundred triangles it does not; each r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from nsm.domains.coarse_to_fine import mean_values
+from nsm.domains.coarse_to_fine import mean_value_weights
 from nsm.domains.decimation import Round, coarsen, undo
 from nsm.domains.kernels import innermost
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
 from nsm.domains.orbifold.newton import Quotient
-from nsm.domains.orbifold.sweeps import Stars, colour_classes, relax
+from nsm.domains.orbifold.stars import Stars, seen
+from nsm.domains.orbifold.sweeps import colour_classes, relax
+from nsm.domains.orbifold.triangles import Triangles
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
 from nsm.errors import NsmError
 from nsm.stages import at
@@ -32,6 +36,7 @@ _SMALL = 1500  # faces of a mesh that may be relaxed after every round
 _WORST = 1e3  # times the mean: a triangle of so much energy is moved on its own
 _LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
 _SLOW = 4000  # faces whose layout is told of
+_KEPT = 5000  # faces of a mesh for whose levels there is memory
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,10 @@ class Effort:
 
 @dataclass
 class Layout:
-    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns."""
+    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns.
+
+    In memory, one coordinate of all vertices comes after the other: they are looked up so.
+    """
 
     lift: np.ndarray
     uv: np.ndarray
@@ -60,38 +68,100 @@ class Layout:
 
     def shaped(self, matrix: np.ndarray) -> None:
         """Apply a linear map (2, 2) to the plane."""
-        self.uv = self.uv @ matrix.T
+        self.uv = (matrix @ self.uv.T).T
         self.lattice = matrix @ self.lattice
+
+
+class Level:
+    """A mesh on the way from a coarse one to the whole, and how its last vertices are put back.
+
+    Attributes:
+        alive: (F',) those of the whole mesh' faces that it has.
+        mesh: its triangles.
+        stars: of the vertices (N,) that are put back; None on the coarsest.
+        target: (N,) what they had been drawn into.
+        weights: (2, M) of the stars' rings, mean values; those of a star add up to one.
+    """
+
+    def __init__(
+        self, vertices: np.ndarray, faces: np.ndarray, step: Round | None, area: float
+    ) -> None:
+        self.alive = _alive(faces)
+        self._faces, self._vertices = faces[self.alive], vertices
+        self._area = area
+        self.stars: Stars | None = None
+        if step is not None:
+            mesh = scaled(vertices, self._faces, area)
+            self.stars = Stars(mesh, faces, step.vertex, step.corners, step.star)
+            middle, d = step.vertex[self.stars.star], self.stars.d
+            weights = mean_value_weights(mesh, middle, self.stars.ring, d)
+            self.weights = weights / self.stars.sums(weights.sum(axis=0))[self.stars.star]
+            self.target = step.target
+
+    @cached_property
+    def mesh(self) -> Triangles:
+        return Triangles(scaled(self._vertices, self._faces, self._area), self._faces)
+
+
+class Levels:
+    """The meshes from a coarse one to the whole, the coarsest first.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) of the coarsest, those that are gone with two equal corners.
+        rounds: of collapses that led to it.
+        area: of the domain.
+    """
+
+    def __init__(
+        self, vertices: np.ndarray, faces: np.ndarray, rounds: list[Round], area: float
+    ) -> None:
+        self.vertices = np.asfortranarray(vertices)  # looked up by coordinates
+        self.faces, self.rounds, self.area = faces, rounds, area
+
+    def __iter__(self) -> Iterator[Level]:
+        # those of a small mesh are kept: more sets of cones may be tried on it
+        return iter(self._kept if len(self.faces) <= _KEPT else self._made())
+
+    def _made(self) -> Iterator[Level]:
+        current = self.faces.copy()
+        yield Level(self.vertices, current, None, self.area)
+        for step in reversed(self.rounds):
+            undo(current, step)
+            yield Level(self.vertices, current, step, self.area)
+
+    @cached_property
+    def _kept(self) -> list[Level]:
+        return list(self._made())
 
 
 @dataclass(frozen=True)
 class Hierarchy:
     """A mesh drawn together in two stages.
 
-    The first stage keeps the surface's shape: its faces (F, 3), those that are gone with two equal
-    corners; its rounds; which faces (F',) are left, and the vertices (V',) that they name. The
-    second, on these alone and in their numbers, leaves a handful of faces (F', 3), and its rounds.
+    The first stage keeps the surface's shape, and leaves some of the faces, with vertices ids
+    (V',). The second, on these alone and in their numbers, leaves a handful of faces.
     """
 
-    faces: np.ndarray
-    rounds: list[Round]
-    alive: np.ndarray
+    first: Levels
     ids: np.ndarray
-    few: np.ndarray
-    last_rounds: list[Round]
+    second: Levels
 
 
 def hierarchy(
-    vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, effort: Effort
+    vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, effort: Effort, area: float
 ) -> Hierarchy:
-    """Draw a closed mesh (V, 3), (F, 3) together; the vertices of a mask (V,) stay."""
+    """Draw a closed mesh (V, 3), (F, 3) together for a domain of an area; the vertices of a mask
+    (V,) stay."""
     if len(faces) > _SLOW:
         at("drawing the mesh together")
     current, rounds = coarsen(vertices, faces, held, effort.coarse)
     alive = _alive(current)
     ids, local = topology.renumbered(current[alive], len(vertices))
     few, last_rounds = collapsed(vertices[ids], local[current[alive]], held[ids], effort.coarsest)
-    return Hierarchy(current, rounds, alive, ids, few, last_rounds)
+    return Hierarchy(
+        Levels(vertices, current, rounds, area), ids, Levels(vertices[ids], few, last_rounds, area)
+    )
 
 
 def laid_out(
@@ -118,27 +188,26 @@ def laid_out(
     effort = effort or Effort()
     held = np.zeros(len(vertices), dtype=bool)
     held[faces[0, 0] if cones is None else cones] = True
-    area = AREA[cones is not None]
-    levels = levels or hierarchy(vertices, faces, held, effort)
-    ids, alive, rounds = levels.ids, levels.alive, levels.rounds
+    levels = levels or hierarchy(vertices, faces, held, effort, AREA[cones is not None])
+    ids, rounds = levels.ids, levels.first.rounds
+    alive = _alive(levels.first.faces)
     local = np.full(len(vertices), -1)
     local[ids] = np.arange(len(ids))
-    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.last_rounds])
+    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
 
-    small = Layout(lift[alive], np.zeros((len(ids), 2)), np.eye(2))
+    small = Layout(lift[alive], np.zeros((2, len(ids))).T, np.eye(2))
     of_cones = None if cones is None else local[cones]
-    few = levels.few.copy()
-    _first(vertices[ids], few, small, of_cones, weights, area)
-    _undone(vertices[ids], few, levels.last_rounds, small, held[ids], area, effort)
+    _first(levels.second, small, of_cones, weights)
+    _undone(levels.second, small, held[ids], effort)
     # canonical coordinates near the domain have the most digits
     gauge = group.identities(len(vertices))
     x, gauge[ids] = group.into_domain(small.uv @ np.linalg.inv(small.lattice).T, cones is not None)
     if cones is not None:
         x[of_cones], gauge[cones] = group.CONES, group.IDENTITY
     lift = group.compose(lift, group.inverse(gauge[_clusters(len(vertices), rounds)[faces]]))
-    layout = Layout(lift, np.zeros((len(vertices), 2)), small.lattice)
+    layout = Layout(lift, np.zeros((2, len(vertices))).T, small.lattice)
     layout.uv[ids] = x @ small.lattice.T
-    _undone(vertices, levels.faces.copy(), rounds, layout, held, area, effort)
+    _undone(levels.first, layout, held, effort)
     return layout
 
 
@@ -148,87 +217,70 @@ def _renamed(step: Round, ids: np.ndarray, alive: np.ndarray) -> Round:
     return Round(ids[step.vertex], ids[step.target], step.before, corners, step.star)
 
 
-def _undone(
-    vertices: np.ndarray,
-    current: np.ndarray,
-    rounds: list[Round],
-    layout: Layout,
-    held: np.ndarray,
-    area: float,
-    effort: Effort,
-) -> None:
+def _undone(levels: Levels, layout: Layout, held: np.ndarray, effort: Effort) -> None:
     """Relax a coarse mesh, and put back the vertices of all rounds."""
-    alive = _alive(current)
-    relax_all(vertices, current, alive, layout, held, area, effort, effort.last)
-    done = len(alive)
-    for step in reversed(rounds):
-        undo(current, step)
-        alive = _alive(current)
-        tight = _put_back(scaled(vertices, current[alive], area), current, layout, step)
-        if len(current) > _SLOW:
-            at("faces laid out", len(alive), len(current))
-        last = step is rounds[0]
-        if last or len(alive) >= effort.growth * done:
-            done = len(alive)
-            steps = effort.last if last else effort.level
-            relax_all(vertices, current, alive, layout, held, area, effort, steps)
-        elif tight and len(alive) <= _SMALL:
+    lifts = seen(layout.lift)
+    whole, done = len(levels.faces), 0
+    for k, level in enumerate(levels):
+        count, tight = len(level.alive), False
+        if level.stars is not None:
+            tight = _put_back(level, lifts, layout)
+            if whole > _SLOW:
+                at("faces laid out", count, whole)
+        last = k == len(levels.rounds)
+        if last or count >= effort.growth * done:
+            steps = effort.last if last or not done else effort.level
+            relax_all(level, lifts, layout, held, effort, steps)
+            done = count
+        elif tight and count <= _SMALL:
             # where there is hardly room, make some before it is used up
-            relax_all(vertices, current, alive, layout, held, area, effort, 1)
+            relax_all(level, lifts, layout, held, effort, 1)
 
 
 def relax_all(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    alive: np.ndarray,
+    level: Level,
+    lifts: np.ndarray,
     layout: Layout,
     held: np.ndarray,
-    area: float,
     effort: Effort,
     steps: int,
 ) -> None:
-    """Lower the energy of those of the faces that are alive, by global steps or by sweeps."""
-    present, lift = faces[alive], layout.lift[alive]
-    mesh = scaled(vertices, present, area)
-    small = len(present) <= 2 * effort.largest
-    classes: list[Stars] | None = None
-    quotient = Quotient(mesh, present, lift, held) if small else None
-    if quotient is None:
-        classes = list(colour_classes(mesh, present, lift, held))
-        shape = _Shape(mesh, present, lift)
+    """Lower the energy of a level's faces, by global steps or by sweeps."""
+    mesh = level.mesh
+    lifts = lifts.reshape(2, 3, -1, 3).take(level.alive, axis=2).reshape(2, 3, -1)
+    quotient = Quotient(mesh, lifts, held)
+    classes: list[tuple[Stars, np.ndarray]] = []
+
+    def swept() -> np.ndarray:
+        """The Jacobians after all vertices have moved on their own."""
+        classes.extend([] if classes else colour_classes(mesh, lifts, held))
+        for stars, rings in classes:
+            relax(layout.uv, layout.lattice, stars, rings)
+        return quotient.jacobians(layout.uv, layout.lattice)
+
+    if len(level.alive) > 2 * effort.largest:
+        j = quotient.jacobians(layout.uv, layout.lattice)
         for _ in range(effort.sweeps):
-            layout.shaped(shape.best(layout))
-            for stars in classes:
-                relax(layout.uv, layout.lattice, stars)
+            layout.shaped(quotient.best_shape(j))
+            j = swept()
         return
     before, stuck = np.inf, True
     for _ in range(steps):
         if stuck:
             # the worst triangles hold global steps up: move their vertices on their own
-            classes = classes or list(colour_classes(mesh, present, lift, held))
             for _ in range(effort.sweeps):
-                for stars in classes:
-                    relax(layout.uv, layout.lattice, stars)
-                energy, worst = quotient.spread(layout.uv, layout.lattice)
+                j = swept()
+                energy, worst = quotient.spread(j)
                 if worst < _WORST * energy:
                     break
-        layout.shaped(quotient.best_shape(layout.uv, layout.lattice))
-        layout.uv, energy, size = quotient.step(layout.uv, layout.lattice)
+        shape = quotient.best_shape(j)
+        layout.shaped(shape)
+        j = np.tensordot(shape, j, 1)
+        layout.uv, j, energy, size = quotient.step(layout.uv, layout.lattice, j)
         stuck = size < 0.1
         if not stuck and before - energy < effort.stop * energy:
             break
         before = energy
-
-
-class _Shape:
-    """The best shape of the lattice for meshes too large to need second derivatives."""
-
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, lift: np.ndarray) -> None:
-        self.quotient = object.__new__(Quotient)
-        Quotient.prepare(self.quotient, vertices, faces, lift)
-
-    def best(self, layout: Layout) -> np.ndarray:
-        return self.quotient.best_shape(layout.uv, layout.lattice)
 
 
 def _alive(faces: np.ndarray) -> np.ndarray:
@@ -241,18 +293,11 @@ def scaled(vertices: np.ndarray, faces: np.ndarray, area: float) -> np.ndarray:
     return vertices * np.sqrt(area / topology.face_areas(vertices, faces).sum())
 
 
-def _first(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    layout: Layout,
-    cones: np.ndarray | None,
-    weights: str,
-    area: float,
-) -> None:
+def _first(levels: Levels, layout: Layout, cones: np.ndarray | None, weights: str) -> None:
     """Tutte's embedding of the coarsest mesh."""
-    alive = _alive(faces)
-    present = faces[alive]
-    weight = edge_weights(vertices, present, weights)
+    alive = _alive(levels.faces)
+    present = levels.faces[alive]
+    weight = edge_weights(levels.vertices, present, weights)
     x, quadratic = tutte(present, layout.lift[alive], weight, cones)
     layout.lattice = best_lattice(quadratic, _LATTICE)
     layout.uv[: len(x)] = x @ layout.lattice.T
@@ -293,45 +338,41 @@ def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.nd
     return group.compose(lift, group.inverse(gauge[faces]))
 
 
-def _put_back(vertices: np.ndarray, faces: np.ndarray, layout: Layout, step: Round) -> bool:
-    """Give a round's vertices places that flip no triangle; whether one was hard to find."""
-    stars = Stars(vertices, faces, layout.lift, step.vertex, step.corners, step.star)
-    uv, lattice = layout.uv, layout.lattice
-    b, c = stars.rings(uv, lattice)
-    target = uv[step.target]
-    place = mean_values(vertices, stars, b, c)
-    missing = _placed(uv, stars, b, c, target, place)
+def _put_back(level: Level, lifts: np.ndarray, layout: Layout) -> bool:
+    """Give a level's last vertices places that flip no triangle; whether one was hard to find."""
+    stars, uv, lattice = level.stars, layout.uv, layout.lattice
+    assert stars is not None
+    own = lifts.take(stars.corners, axis=2)
+    rings = stars.rings(own, uv, lattice)
+    place = stars.sums((level.weights[:, None] * rings).sum(axis=0))
+    missing = _placed(uv, stars, stars.forms(rings), uv[level.target].T, place)
     for number in missing.tolist():
-        mine = stars.star == number
-        at = innermost(b[mine], c[mine], _LEAST_ROOM)
+        b, c = rings[:, :, stars.star == number].transpose(0, 2, 1)
+        at = innermost(b, c, _LEAST_ROOM)
         if at is None:
             raise NsmError("a vertex finds no place without a flip", kind="not_injective")
-        uv[step.vertex[number]] = at
+        uv[stars.vertex[number]] = at
     for _ in range(_STEPS):
-        relax(uv, lattice, stars)
+        relax(uv, lattice, stars, own)
     return len(missing) > 0
 
 
 def _placed(
-    uv: np.ndarray,
-    stars: Stars,
-    b: np.ndarray,
-    c: np.ndarray,
-    target: np.ndarray,
-    place: np.ndarray,
+    uv: np.ndarray, stars: Stars, forms: np.ndarray, target: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Move each middle to its place (N, 2), or as near to it from its target as it flips nothing;
+    """Move each middle to its place (2, N), or as near to it from its target as it flips nothing;
     numbers of those that found no place."""
-    missing, share = np.arange(len(place)), 1.0
+    missing, share = np.arange(len(stars.vertex)), 1.0
     for _ in range(_TRIES):
         trial = target + share * (place - target)
         with np.errstate(all="ignore"):
-            fits = np.isfinite(stars.energy(b, c, trial))
-        uv[stars.vertex[fits]] = trial[fits]
-        corners, left = ~fits[stars.star], ~fits
-        stars, b, c = stars.chosen(left), b[corners], c[corners]
-        target, place, missing = target[left], place[left], missing[left]
-        if len(missing) == 0:
-            break
+            fits = np.isfinite(stars.energy(forms, trial))
+        uv[stars.vertex[fits]] = trial[:, fits].T
+        if fits.all():
+            return missing[:0]
+        left = ~fits
+        stars, corners = stars.chosen(left)
+        forms, target, place = forms.take(corners, axis=1), target[:, left], place[:, left]
+        missing = missing[left]
         share *= _NEARER
     return missing

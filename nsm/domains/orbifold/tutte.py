@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from nsm.domains.orbifold import group
 from nsm.errors import NsmError
@@ -68,12 +68,18 @@ def tutte(
     return x, (edge * w[:, None]).T @ edge
 
 
-def factorised(matrix: csc_matrix):  # type: ignore[no-untyped-def]
-    """A factorisation of a symmetric positive definite matrix, ordered for its symmetry."""
+def factorised(matrix: csc_matrix, ordered: bool = False) -> SuperLU:
+    """A factorisation of a symmetric positive definite matrix.
+
+    Args:
+        matrix: the matrix.
+        ordered: whether elimination in the order of its rows fills in little; if not, another
+            order is sought.
+    """
     # supernodes are not enlarged: on meshes that costs more than it saves
     return splu(
         matrix,
-        permc_spec="MMD_AT_PLUS_A",
+        permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         relax=1,
         panel_size=4,

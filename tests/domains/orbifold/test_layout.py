@@ -17,7 +17,10 @@ from nsm.domains.orbifold.cones import compared
 from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, laid_out, scaled
 from nsm.domains.orbifold.newton import Quotient, distortions
+from nsm.domains.orbifold.pattern import Pattern
+from nsm.domains.orbifold.stars import seen
 from nsm.domains.orbifold.sweeps import colour_classes, relax
+from nsm.domains.orbifold.triangles import Triangles
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
 from nsm.surfaces import topology
 
@@ -34,9 +37,30 @@ def _problem(seed: int = 1, count: int = 25):  # type: ignore[no-untyped-def]
     return mesh, faces, lift, cones, held, x, lattice
 
 
+def _quotient(mesh, faces, lift, held) -> Quotient:  # type: ignore[no-untyped-def]
+    return Quotient(Triangles(mesh, faces), seen(lift), held)
+
+
+def _energy(quotient: Quotient, uv: np.ndarray, lattice: np.ndarray) -> float:
+    return quotient.energy(quotient.jacobians(uv, lattice))
+
+
+def test_jacobians_by_the_definition() -> None:
+    mesh, faces, lift, _, held, x, lattice = _problem()
+    j = _quotient(mesh, faces, lift, held).jacobians(x @ lattice.T, lattice)
+    corner = group.moved(lift, x[faces]) @ lattice.T
+    for f in range(len(faces)):
+        flat = np.stack([mesh[faces[f, k]] - mesh[faces[f, 0]] for k in (1, 2)], axis=1)
+        sides = np.stack([corner[f, k] - corner[f, 0] for k in (1, 2)], axis=1)
+        # |J v| for tangents v of the triangle, by their coefficients along its sides
+        inverse = np.linalg.inv(np.linalg.qr(flat)[1])
+        expected = np.linalg.svd(sides @ inverse, compute_uv=False)
+        assert np.linalg.svd(j[:, :, f], compute_uv=False) == pytest.approx(expected)
+
+
 def test_the_gradient_is_that_of_the_energy() -> None:
     mesh, faces, lift, _, held, x, lattice = _problem()
-    quotient = Quotient(mesh, faces, lift, held)
+    quotient = _quotient(mesh, faces, lift, held)
     uv = x @ lattice.T
     gradient, hessian = quotient._derivatives(quotient.jacobians(uv, lattice))
     slope = quotient._gathered(gradient)
@@ -45,39 +69,67 @@ def test_the_gradient_is_that_of_the_energy() -> None:
         way = rng.normal(size=uv.shape)
         way[held] = 0
         h = 1e-7
-        change = quotient.energy(uv + h * way, lattice) - quotient.energy(uv - h * way, lattice)
-        assert change / (2 * h) == pytest.approx(float((slope * way).sum()), rel=1e-4)
-    assert np.linalg.eigvalsh(hessian).min() >= -1e-9 * np.abs(hessian).max()
+        ahead, behind = (_energy(quotient, uv + s * h * way, lattice) for s in (1, -1))
+        assert (ahead - behind) / (2 * h) == pytest.approx(float((slope * way).sum()), rel=1e-4)
+    matrices = hessian.transpose(4, 2, 0, 3, 1).reshape(-1, 6, 6)
+    assert np.linalg.eigvalsh(matrices).min() >= -1e-9 * np.abs(hessian).max()
 
 
 def test_second_derivatives_are_exact_where_they_are_positive() -> None:
     mesh, faces, lift, _, held, _, lattice = _problem()
-    quotient = Quotient(mesh, faces, lift, held)
+    quotient = _quotient(mesh, faces, lift, held)
     # where nothing shrinks no eigenvalue is negative
     rng = np.random.default_rng(2)
-    j = 1.5 * np.eye(2) + 0.05 * rng.normal(size=(len(faces), 2, 2))
+    j = 1.5 * np.eye(2)[:, :, None] + 0.05 * rng.normal(size=(2, 2, len(faces)))
     _, hessian = quotient._derivatives(j)
+    x, y, z = quotient.mesh.hats
+    hats = np.stack([[-x, -y - z], [x, y], [0 * z, z]])
+    hats[1:] *= quotient._sign[:, None]
     h = 1e-6
     for k in range(3):
         for i in range(2):
-            step = np.zeros((len(faces), 3, 2))
-            step[:, k, i] = h
-            change = np.einsum("fki,fkj->fij", step * quotient.sign[:, :, None], quotient.gradients)
+            change = np.zeros_like(j)
+            change[i] = h * hats[k]
             ahead = quotient._derivatives(j + change)[0]
             behind = quotient._derivatives(j - change)[0]
-            column = ((ahead - behind) * quotient.sign[:, :, None] / (2 * h)).reshape(-1, 6)
             np.testing.assert_allclose(
-                hessian[:, :, 2 * k + i], column, rtol=1e-4, atol=1e-4 * np.abs(hessian).max()
+                hessian[:, i, :, k],
+                (ahead - behind) / (2 * h),
+                rtol=1e-4,
+                atol=1e-4 * np.abs(hessian).max(),
             )
+
+
+@pytest.mark.parametrize("held", [(), (0, 6, 12, 18)])
+def test_the_matrix_is_the_sum_of_second_derivatives(held: tuple[int, ...]) -> None:
+    _, faces = hull(3, 25)
+    rng, n = np.random.default_rng(0), 25
+    parts = rng.normal(size=(2, 3, 6, len(faces)))
+    values = np.einsum("ikaf,jlaf->ijklf", parts, parts)
+    values[[0, 1], [0, 1]] += 0.1 * np.eye(3)[:, :, None]
+    expected = np.zeros((n, 2, n, 2))
+    for f, corner in enumerate(faces):
+        for k, v in enumerate(corner):
+            for m, w in enumerate(corner):
+                expected[v, :, w] += values[:, :, k, m, f]
+    stays = np.zeros(n, dtype=bool)
+    stays[list(held)] = True
+    expected[stays], expected[:, :, stays] = 0.0, 0.0
+    expected[stays, :, stays] = np.eye(2)
+    pattern = Pattern(faces, n)
+    right = rng.normal(size=(n, 2))
+    found = pattern.factorised(values, stays).solve(right[pattern.ids].ravel()).reshape(n, 2)
+    solution = np.linalg.solve(expected.reshape(2 * n, 2 * n), right.ravel()).reshape(n, 2)
+    np.testing.assert_allclose(found, solution[pattern.ids], rtol=1e-6, atol=1e-6)
 
 
 def test_the_lattices_best_shape() -> None:
     mesh, faces, lift, _, held, x, lattice = _problem()
-    quotient = Quotient(mesh, faces, lift, held)
+    quotient = _quotient(mesh, faces, lift, held)
     uv = x @ lattice.T
-    best = quotient.best_shape(uv, lattice)
+    best = quotient.best_shape(quotient.jacobians(uv, lattice))
     assert np.linalg.det(best) == pytest.approx(1.0)
-    least = quotient.energy(uv @ best.T, best @ lattice)
+    least = _energy(quotient, uv @ best.T, best @ lattice)
     rng = np.random.default_rng(0)
     for size in (1e-3, 0.1, 1.0):
         for _ in range(10):
@@ -85,7 +137,7 @@ def test_the_lattices_best_shape() -> None:
             if np.linalg.det(other) <= 0.01:
                 continue
             other /= np.sqrt(np.linalg.det(other))
-            assert quotient.energy(uv @ other.T, other @ lattice) >= least - 1e-9 * least
+            assert _energy(quotient, uv @ other.T, other @ lattice) >= least - 1e-9 * least
 
 
 def test_distortion_by_the_definition() -> None:
@@ -107,16 +159,19 @@ def test_distortion_by_the_definition() -> None:
 
 def test_steps_and_sweeps_lower_the_energy_and_flip_nothing() -> None:
     mesh, faces, lift, cones, held, x, lattice = _problem(4, 60)
-    quotient = Quotient(mesh, faces, lift, held)
+    quotient = _quotient(mesh, faces, lift, held)
     uv = x @ lattice.T
-    energies = [quotient.energy(uv, lattice)]
-    classes = list(colour_classes(mesh, faces, lift, held))
+    j = quotient.jacobians(uv, lattice)
+    energies = [quotient.energy(j)]
+    classes = list(colour_classes(quotient.mesh, seen(lift), held))
     for _ in range(10):
-        uv, value, _ = quotient.step(uv, lattice)
+        uv, there, value, _ = quotient.step(uv, lattice, j)
+        assert there == pytest.approx(quotient.jacobians(uv, lattice))
         energies.append(value)
-        for stars in classes:
-            relax(uv, lattice, stars)
-        energies.append(quotient.energy(uv, lattice))
+        for stars, lifts in classes:
+            relax(uv, lattice, stars, lifts)
+        j = quotient.jacobians(uv, lattice)
+        energies.append(quotient.energy(j))
     assert (np.diff(energies) <= 1e-9 * energies[0]).all()
     assert energies[-1] < 0.9 * energies[0]
     x = np.linalg.solve(lattice, uv.T).T
