@@ -91,10 +91,10 @@ def steps_of(*words, overrides=()):
 
 
 def test_maps_take_the_fit_alone():
-    choices = ([], ["phi.steps=100"], ["phi.steps=null"])
+    choices = ([], ["phi.steps=50"], ["phi.steps=null"])
     alone, few, whole = (steps_of(*words) for words in choices)
-    assert alone[0] == 0 and few[0] == 100
-    assert whole[0] == compose_config(["task=overfit"]).trainer.max_steps > 100
+    assert alone[0] == 0 and few[0] == 50
+    assert whole[0] == compose_config(["task=overfit"]).trainer.max_steps > 50
     assert len({alone[1], few[1], whole[1]}) == 3  # apart in the cache
     assert steps_of(overrides=["trainer.max_steps=70"])[0] == 70
 
