@@ -454,7 +454,7 @@ class PairConstraints(Checked):
     multipliers_from: Share = 0.0
     injectivity: Literal["exponential", "smooth"] = "exponential"
     triangles_from: Share = 1.0
-    settled: Share = 1e-3
+    settled: Weight = 1e-3
 
 
 @dataclass(frozen=True)

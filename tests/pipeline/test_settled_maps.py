@@ -16,7 +16,7 @@ from nsm.tasks import CollectionMap, PairMap, constrained
 WORDS = ["data.batch_size=64", "data.held_out=64", "data.steps_per_epoch=4", "logger=none"]
 WORDS += ["trainer.max_steps=20", "trainer.threads=1", "trainer.progress=false", "artefacts=false"]
 WORDS += ["map.cells=8", "constraints.triangles_from=0.8", "optimizer.iterations=4"]
-WORDS += ["constraints.settled=1"]
+WORDS += ["constraints.settled=1e9"]
 
 
 @cache
