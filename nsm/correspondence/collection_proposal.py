@@ -15,19 +15,17 @@ from itertools import combinations
 import numpy as np
 
 from nsm.correspondence.coarse_shape import COMMON, CoarseShape, coarse_shape
-from nsm.correspondence.further_ends import further_ends
 from nsm.correspondence.joint_choice import Way, ways
 from nsm.correspondence.layouts import quick_scores
 from nsm.correspondence.proposal import (
     LEAST_LANDMARKS,
     LEAST_MARGIN,
     Hypothesis,
-    away_from,
+    completed,
     hypotheses,
     told_apart,
 )
 from nsm.correspondence.scores import compared
-from nsm.errors import NsmError
 from nsm.stages import counted
 
 _KEPT = 5
@@ -96,30 +94,10 @@ def proposed_for_all(
         taken = [replace(h, whole=True) for h in taken]
     sure = bool(margin > LEAST_MARGIN and all(h.good for h in taken))
     if sure and len(vertices[0]) >= COMMON:
-        vertices[0] = _completed(meshes, hub, vertices[0], len(fixed))
+        in_turn = counted("ends of limbs", others)
+        vertices[0] = completed(vertices[0], len(fixed), meshes, hub, in_turn)
     scores = [way.total / len(others) for way in kept]
     return CollectionProposal(vertices, scores, margin, len(fixed), sure)
-
-
-def _completed(
-    meshes: Sequence[tuple[np.ndarray, np.ndarray]], hub: int, rows: np.ndarray, given: int
-) -> np.ndarray:
-    """Landmarks (L, k) with those ends of the hub's limbs that correspond to ends of all others;
-    as they are where one has no finer layout. Given ones, if they are five or more, decide alone.
-    """
-    known = rows[:given] if given >= COMMON else rows
-    others = [i for i in range(len(meshes)) if i != hub]
-    ends: dict[int, dict[int, int]] = {}
-    for i in counted("ends of limbs", others):
-        try:
-            pairs = further_ends((meshes[hub], meshes[i]), known[:, [hub, i]])
-        except NsmError:
-            return rows
-        ends[i] = dict(pairs.tolist())
-    of_all = [v for v in ends[others[0]] if all(v in found for found in ends.values())]
-    more = [[v if i == hub else ends[i][v] for i in range(len(meshes))] for v in of_all]
-    found = np.array(more, dtype=np.int64).reshape(-1, len(meshes))
-    return np.concatenate([known, found, away_from(found, rows[len(known) :], meshes)])
 
 
 def _margin(found: Sequence[Way]) -> float:

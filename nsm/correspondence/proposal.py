@@ -6,7 +6,7 @@ way, the target in several, of which the maps' scores tell the right one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,33 +131,51 @@ def _margin(kept: list[Hypothesis]) -> float:
 
 
 def _completed(best: Hypothesis, given: np.ndarray) -> Hypothesis:
-    """The hypothesis with those ends of limbs that a map through its landmarks meets at little
-    cost; without them where the finer shapes have no layout.
+    """The hypothesis with ends of limbs, see :func:`completed`."""
+    at("ends of limbs")
+    shapes = best.candidate.source.shape, best.candidate.target.shape
+    meshes = [shape.mesh.arrays for shape in shapes]
+    return replace(best, vertices=completed(best.vertices, len(given), meshes, 0, [1]))
+
+
+def completed(
+    rows: np.ndarray,
+    given: int,
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]],
+    hub: int,
+    others: Iterable[int],
+) -> np.ndarray:
+    """Landmarks with those ends of limbs that maps through them meet at little cost; as they are
+    where the finer shapes have no layout.
 
     Given landmarks, if they are five or more, decide alone; tips come after the ends.
+
+    Args:
+        rows: (L, k) vertices of k meshes, the given ones first.
+        given: how many of the rows were given.
+        meshes: vertices (V, 3) and faces (F, 3) of each.
+        hub: the mesh whose ends are matched with those of each other one.
+        others: the other meshes; ends come in that correspond to ends of all of them.
     """
-    at("ends of limbs")
-    known = best.vertices[: len(given)] if len(given) >= COMMON else best.vertices
-    shapes = best.candidate.source.shape, best.candidate.target.shape
-    meshes = shapes[0].mesh.arrays, shapes[1].mesh.arrays
-    try:
-        more = further_ends(meshes, known)
-    except NsmError:
-        return best
-    tips = away_from(more, best.vertices[len(known) :], meshes)
-    return replace(best, vertices=np.concatenate([known, more, tips]))
-
-
-def away_from(
-    ends: np.ndarray, tips: np.ndarray, meshes: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> np.ndarray:
-    """Of corresponding tips (T, k), vertices of k meshes, those that are near to no end (L, k)."""
+    known = rows[:given] if given >= COMMON else rows
+    ends: dict[int, dict[int, int]] = {}
+    for i in others:
+        try:
+            pairs = further_ends((meshes[hub], meshes[i]), known[:, [hub, i]])
+        except NsmError:
+            return rows
+        ends[i] = dict(pairs.tolist())
+    first, *rest = ends.values()
+    of_all = [v for v in first if all(v in found for found in rest)]
+    found = [[v if i == hub else ends[i][v] for i in range(len(meshes))] for v in of_all]
+    more = np.array(found, dtype=np.int64).reshape(-1, len(meshes))
+    tips = rows[len(known) :]
     for k, (vertices, faces) in enumerate(meshes):
-        if len(ends) and len(tips):
-            apart = edge_distances(vertices, faces, ends[:, k])[:, tips[:, k]].min(axis=0)
+        if len(more) and len(tips):
+            apart = edge_distances(vertices, faces, more[:, k])[:, tips[:, k]].min(axis=0)
             area = topology.face_areas(vertices, faces).sum()
             tips = tips[apart > _NEAR * np.sqrt(area)]
-    return tips
+    return np.concatenate([known, more, tips])
 
 
 def _told_apart(kept: list[Hypothesis]) -> list[Hypothesis]:

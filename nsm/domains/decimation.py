@@ -211,7 +211,7 @@ def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarra
     result = np.zeros(len(into), dtype=bool)
     corner = [points.take(faces[:, k], axis=1) for k in range(3)]
     sides = np.stack([corner[k - 1] - corner[k - 2] for k in range(3)], axis=1)  # opposite each
-    normal = _cross(sides[:, 1], sides[:, 2])
+    normal = topology.cross_product(sides[:, 1], sides[:, 2])
     double = np.sqrt(_dot(normal, normal))
     squares = _dot(sides, sides)
     shape = double / squares.sum(axis=0)
@@ -221,7 +221,7 @@ def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarra
         kept = np.flatnonzero((w >= 0) & (w != b) & (w != c))
         to = points.take(w[kept], axis=1)
         to_b, to_c = corner[k - 2].take(kept, axis=1) - to, corner[k - 1].take(kept, axis=1) - to
-        new = _cross(to_b, to_c)
+        new = topology.cross_product(to_b, to_c)
         new_double = np.sqrt(_dot(new, new))
         new_shape = new_double / (squares[k][kept] + _dot(to_b, to_b) + _dot(to_c, to_c))
         bad = _dot(normal.take(kept, axis=1), new) < _TURN * new_double * double[kept]
@@ -233,10 +233,3 @@ def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarra
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Of vectors (3, ...), by coordinates."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of vectors (3, ...), by coordinates."""
-    return np.array(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )

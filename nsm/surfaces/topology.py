@@ -156,12 +156,19 @@ def renumbered(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(used), np.cumsum(used) - 1
 
 
+def cross_product(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Of vectors (3, ...), by coordinates: (3, ...)."""
+    return np.array(
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    )
+
+
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Areas (F,) of the triangles of a 3D mesh, in the square of its unit."""
     # by coordinates: this is asked for often, of few faces
     a, b, c = vertices.T.take(faces.T, axis=1).transpose(1, 0, 2)
     u, v = b - a, c - a
-    cross = u[[1, 2, 0]] * v[[2, 0, 1]] - u[[2, 0, 1]] * v[[1, 2, 0]]
+    cross = cross_product(u, v)
     return np.asarray(0.5 * np.sqrt((cross * cross).sum(axis=0)))
 
 

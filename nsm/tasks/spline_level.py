@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -54,23 +55,19 @@ class Level:
         inner, smooth = _forms(self.grid.side, cells, field.periodic)
         self.floor = (_FLOOR * (whole.T @ inner @ whole)).tocsc()
         self.smoothness = (whole.T @ smooth @ whole).tocsc()
-        self._order: np.ndarray | None = None
 
     @property
     def rows(self) -> int:
         """Coefficients of each component."""
         return int(self.up.shape[1])
 
-    @property
+    @cached_property
     def order(self) -> np.ndarray:
         """An order of the rows in which factors of their matrices fill in little."""
-        if self._order is None:
-            row, column = np.divmod(np.arange(self.rows), self.grid.side)
-            if self.grid.odd:  # the pillow's two sides lie on each other: neighbours are near
-                column = np.minimum(column, self.grid.side - 1 - column)
-            place = np.stack([row, column], axis=1)
-            self._order = nested_dissection(self.smoothness.tocsr(), place)
-        return self._order
+        row, column = np.divmod(np.arange(self.rows), self.grid.side)
+        if self.grid.odd:  # the pillow's two sides lie on each other: neighbours are near
+            column = np.minimum(column, self.grid.side - 1 - column)
+        return nested_dissection(self.smoothness.tocsr(), np.stack([row, column], axis=1))
 
     def restored(self, fine: np.ndarray) -> np.ndarray:
         """The level's coefficients (rows, d) of a spline of the level, given on the fine grid."""

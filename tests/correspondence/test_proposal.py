@@ -325,7 +325,7 @@ def test_ends_that_all_members_of_a_collection_have_complete_its_landmarks(
         both = [(tips[0][3], tips[1][3]), (tips[0][4], tips[1][4])]
         return np.array(both if len(seen) == 1 else both[1:])
 
-    monkeypatch.setattr(collection_proposal, "further_ends", ends)
+    monkeypatch.setattr(proposal, "further_ends", ends)
     monkeypatch.setattr(collection_proposal, "hub_of", lambda _: 0)
     between = np.abs(np.linalg.norm(source[0], axis=1) - 1).argsort()[[0, 40]]
     images = np.abs(np.linalg.norm((target[0] - [5, 6, 7]) / 40, axis=1) - 1).argsort()[[0, 40]]

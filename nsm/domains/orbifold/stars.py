@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nsm.domains.orbifold import group
+from nsm.surfaces import topology
 
 
 def hats(
@@ -27,7 +28,7 @@ def hats(
     mean = max(float(lu.sum()) / max(len(lu), 1), 1e-300)
     lu = np.maximum(lu, 1e-9 * mean)
     along = (u * v).sum(axis=0) / lu
-    cross = u[[1, 2, 0]] * v[[2, 0, 1]] - u[[2, 0, 1]] * v[[1, 2, 0]]
+    cross = topology.cross_product(u, v)
     double = np.sqrt((cross * cross).sum(axis=0))
     longest = np.maximum(lu, np.sqrt((v * v).sum(axis=0)))
     double = np.maximum(double, flattest * longest**2)
