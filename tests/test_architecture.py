@@ -22,7 +22,7 @@ ROOMS = [
 ]
 # what every room may import
 COMMON = {
-    *("errors", "instantiation", "optional_dependencies", "settings"),
+    *("compiled", "errors", "instantiation", "optional_dependencies", "settings"),
     *("side_by_side", "stages", "wording"),
 }
 # rooms that stand for themselves: meshes in numpy, and maps in torch
