@@ -8,10 +8,11 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from nsm.errors import NsmError
 from nsm.instantiation import target_of
+from nsm.maps import bsplines
+from nsm.maps.bsplines import basis, readable
 
 
 class Encoding(Protocol):
@@ -43,15 +44,6 @@ def pushed_forward(function: Callable[[Tensor], Tensor], stack: Tensor) -> Tenso
     points = stack[0].repeat(tangents, 1)
     value, pushed = torch.func.jvp(function, (points,), (stack[1:].flatten(0, 1),))[:2]
     return torch.cat([value[None, :count], pushed.unflatten(0, (tangents, count))])
-
-
-def transformed() -> bool:
-    """Whether a transform of torch.func is active.
-
-    The operations with a backward pass of their own then give way to plain ones, which all
-    transforms know.
-    """
-    return not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active()
 
 
 def as_encoding(given: Any, config: dict[str, Any] | None = None) -> Encoding:
@@ -144,103 +136,6 @@ class RandomFourierFeatures(nn.Module):
         return torch.cat([value[None], tangents])
 
 
-def _bspline(t: Tensor, degree: int) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-    """The degree + 1 weights of the uniform B-spline at offset t in [0, 1), d/dt, and d²/dt²."""
-    s = 1 - t
-    if degree == 2:
-        one = torch.ones_like(t)
-        weights = [0.5 * s * s, 0.5 + t * s, 0.5 * t * t]
-        return weights, [-s, 1 - 2 * t, t], [one, -2 * one, one]
-    weights = [
-        s**3 / 6,
-        (3 * t**3 - 6 * t**2 + 4) / 6,
-        (3 * s**3 - 6 * s**2 + 4) / 6,
-        t**3 / 6,
-    ]
-    slopes = [-0.5 * s**2, 1.5 * t**2 - 2 * t, 2 * s - 1.5 * s**2, 0.5 * t**2]
-    return weights, slopes, [s, 3 * t - 2, 3 * s - 2, t]
-
-
-class _Blend(torch.autograd.Function):
-    """Features of all levels, blended for value and tangents, with the backward pass written out.
-
-    Plain autograd goes through tensors of all taps of all points, one small operation for each
-    step of the formulas, and sorts indices for each table.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        x: Tensor,
-        taps: Tensor,
-        derivatives: tuple[Tensor, Tensor, Tensor],
-        record: bool,
-        *tables: Tensor,
-    ) -> Tensor:
-        """Blended features of points x (N, 2): (3, N, L · F).
-
-        Args:
-            taps: (L, k², N) rows of the tables that each point sees.
-            derivatives: (L, 2, k, N) weights along either axis, and their first and second
-                derivatives.
-            record: whether there will be a backward pass.
-            tables: one for each of L levels, (rows, F).
-        """
-        turned = record and ctx.needs_input_grad[0]
-        count = derivatives[0].shape[-1]
-        # value, ∂u, ∂v, and for the gradient by x: ∂uu, ∂uv, ∂vv
-        orders = [(0, 0), (1, 0), (0, 1), *([(2, 0), (1, 1), (0, 2)] if turned else [])]
-        blend = torch.stack(
-            [derivatives[i][:, 0, :, None] * derivatives[j][:, 1, None] for i, j in orders], dim=1
-        ).flatten(2, 3)
-        rows = taps.transpose(1, 2)[:, None].expand(-1, len(orders), -1, -1)
-        features = [
-            nn.functional.embedding_bag(
-                row.reshape(-1, row.shape[-1]),
-                table,
-                mode="sum",
-                per_sample_weights=weight.transpose(1, 2).reshape(-1, weight.shape[1]),
-            ).view(len(orders), count, table.shape[1])
-            for row, weight, table in zip(rows, blend, tables, strict=True)
-        ]
-        out = torch.cat([f[:3] for f in features], dim=-1)
-        trained = record and any(ctx.needs_input_grad[4:])
-        ctx.save_for_backward(
-            torch.cat([f[1:] for f in features], dim=-1) if turned else None,
-            *((taps, blend[:, :3]) if trained else (None, None)),
-        )
-        ctx.shapes = [table.shape for table in tables]
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        derivatives, taps, blend = ctx.saved_tensors
-        by_x = None
-        if derivatives is not None:
-            u, v, uu, uv, vv = derivatives
-            g, gu, gv = gradient
-            by_x = torch.stack(
-                [(g * u + gu * uu + gv * uv).sum(dim=1), (g * v + gu * uv + gv * vv).sum(dim=1)],
-                dim=1,
-            )
-        by_table: list[Tensor | None] = [None] * len(ctx.shapes)
-        if blend is not None:
-            # points innermost: long rows for the processor
-            g = gradient.transpose(1, 2).contiguous()
-            g = g.view(3, len(ctx.shapes), 1, ctx.shapes[0][1], gradient.shape[1])
-            shares = blend[:, 0, :, None] * g[0]
-            for plane in (1, 2):
-                shares.addcmul_(blend[:, plane, :, None], g[plane])
-            width = shares.shape[2]
-            places = taps[:, :, None] * width + torch.arange(width, device=taps.device)[:, None]
-            for level, shape in enumerate(ctx.shapes):
-                flat = gradient.new_zeros(shape).view(-1)
-                flat.scatter_add_(0, places[level].flatten(), shares[level].flatten())
-                by_table[level] = flat.view(shape)
-        return (by_x, None, None, None, *by_table)
-
-
 class SplineGrid(nn.Module):
     """Multi-resolution grids of trainable features, blended by uniform B-splines.
 
@@ -304,7 +199,7 @@ class SplineGrid(nn.Module):
         free = z - cell
         offset = free.clamp(0, 1)
         within = (offset == free) * per_unit  # beyond the rim nothing changes
-        weights, slopes, bends = _bspline(offset, self.degree)
+        weights, slopes, bends = basis(offset, self.degree)
         step = torch.arange(self.degree + 1, device=x.device)[:, None]
         corner = cell.long()
         across = (corner[:, 0, None] + step) * (size + self.degree)
@@ -334,11 +229,23 @@ class SplineGrid(nn.Module):
 
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""
-        if transformed():
-            return pushed_forward(self, Identity(2).value_and_jacobian_stack(x))
-        with torch.no_grad():
-            rows, orders = self._seen(x)
-        return self._blended(x, rows, orders, list(self.tables))
+        unit = Identity(2).value_and_jacobian_stack(x)
+        return torch.cat([unit, self.blended(x, list(self.tables), tangents=True)], dim=-1)
+
+    @property
+    def grids(self) -> list[bsplines.Grid]:
+        """Of each level."""
+        kind = bsplines.CLAMPED
+        return [bsplines.Grid((r, r), self.extent, self.degree, kind) for r in self.resolutions]
+
+    def blended(self, x: Tensor, tables: Sequence[Tensor], tangents: bool) -> Tensor:
+        """Features of all levels at points (N, 2), read off tables like those of the grid:
+        (P, N, L · F), P = 1, or 3 with both tangents."""
+        once = tangents or not x.requires_grad  # values may be differentiated twice
+        if once and readable(x, *tables):
+            return bsplines.read(x, self.grids, tables, tangents)
+        rows, orders = self._seen(x)
+        return _summed(rows, orders, tables, tangents)
 
     @classmethod
     def batched_stacks(cls, grids: Sequence[SplineGrid], x: Tensor) -> Tensor:
@@ -351,34 +258,46 @@ class SplineGrid(nn.Module):
             (k, 3, N, out_dim).
         """
         first, points = grids[0], x.flatten(0, 1)
-        with torch.no_grad():
-            rows, orders = first._seen(points)
-            lengths = [len(table) for table in first.tables]
-            # the features of a level lie one grid below the other
-            offsets = torch.tensor(lengths, device=x.device)[:, None] * torch.arange(
-                len(grids), device=x.device
-            )
-            rows = rows + offsets.repeat_interleave(x.shape[1], dim=1)[:, None]
+        if readable(x, *(table for grid in grids for table in grid.tables)):
+            each = zip(grids, x, strict=True)
+            return torch.stack([grid.value_and_jacobian_stack(own) for grid, own in each])
+        rows, orders = first._seen(points)
+        lengths = [len(table) for table in first.tables]
+        # the features of a level lie one grid below the other
+        offsets = torch.tensor(lengths, device=x.device)[:, None] * torch.arange(
+            len(grids), device=x.device
+        )
+        rows = rows + offsets.repeat_interleave(x.shape[1], dim=1)[:, None]
         tables = [torch.cat(level) for level in zip(*(g.tables for g in grids), strict=True)]
-        stack = first._blended(points, rows, orders, tables)
+        stack = _summed(rows, orders, tables, tangents=True)
+        if first.out_dim > stack.shape[-1]:  # x itself is a feature
+            stack = torch.cat([Identity(2).value_and_jacobian_stack(points), stack], dim=-1)
         return stack.view(3, *x.shape[:2], -1).transpose(0, 1)
 
-    @staticmethod
-    def _blended(
-        x: Tensor, rows: Tensor, orders: list[list[Tensor]], tables: list[Tensor]
-    ) -> Tensor:
-        value, first, second = (torch.stack(w, dim=2) for w in orders)
-        unit = torch.eye(2, dtype=x.dtype, device=x.device)[:, None, :].expand(-1, x.shape[0], -1)
-        blended = _Blend.apply(x, rows, (value, first, second), torch.is_grad_enabled(), *tables)
-        return torch.cat([torch.cat([x[None], unit]), blended], dim=-1)
-
     def forward(self, x: Tensor) -> Tensor:
-        rows, (weights, _, _) = self._seen(x)
-        both = torch.stack(weights, dim=2)
-        blend = (both[:, 0, :, None] * both[:, 1, None]).flatten(1, 2)
-        parts = [x]
-        for row, weight, table in zip(rows, blend, self.tables, strict=True):
-            # not an embedding, whose backward pass sorts
-            seen = table.index_select(0, row.flatten()).view(*row.shape, self.features)
-            parts.append((weight[:, :, None] * seen).sum(dim=0))
-        return torch.cat(parts, dim=-1)
+        return torch.cat([x, self.blended(x, list(self.tables), tangents=False)[0]], dim=-1)
+
+
+def _summed(
+    rows: Tensor, orders: list[list[Tensor]], tables: Sequence[Tensor], tangents: bool
+) -> Tensor:
+    """Features blended by plain operations, which all devices and transforms know.
+
+    Args:
+        rows: (L, k², N) of the tables that N points see.
+        orders: weights (L, 2, N) of the k rows along each axis, and their first derivatives.
+        tables: L, (rows, F) each.
+        tangents: whether both are wanted.
+
+    Returns:
+        (P, N, L · F), P = 1 or 3.
+    """
+    w, d = (torch.stack(order, dim=2) for order in orders[:2])  # (L, 2, k, N)
+    pairs = [(w, w), (d, w), (w, d)] if tangents else [(w, w)]
+    blend = torch.stack([(u[:, 0, :, None] * v[:, 1, None]).flatten(1, 2) for u, v in pairs])
+    parts = []
+    for level, table in enumerate(tables):
+        # not an embedding, whose backward pass sorts
+        seen = table.index_select(0, rows[level].flatten()).view(*rows.shape[1:], -1)
+        parts.append((blend[:, level, ..., None] * seen).sum(dim=1))
+    return torch.cat(parts, dim=-1)

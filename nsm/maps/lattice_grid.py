@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from nsm.maps.encodings import SplineGrid, _bspline, _config
+from nsm.maps import bsplines
+from nsm.maps.bsplines import basis
+from nsm.maps.encodings import SplineGrid, _config
 
 _DEGREE = 2
 _TAPS = torch.arange(-1, 2)
@@ -113,7 +115,7 @@ class LatticeSplineGrid(SplineGrid):
         size = cells[:, :, None].to(x.dtype)
         z = (y + 1) * (0.5 * size)
         cell = z.detach().floor().clamp(min=0).minimum(size - 1)
-        weights, slopes, bends = _bspline(z - cell, _DEGREE)
+        weights, slopes, bends = basis(z - cell, _DEGREE)
         corner, side = cell.long(), cells[:, :, None]
         # the cell itself and those beside it, around the period; cheaper than remainders
         before = torch.where(corner == 0, side, corner) - 1
@@ -124,12 +126,16 @@ class LatticeSplineGrid(SplineGrid):
         scaled = [[w * rate for w in slopes], [w * rate * rate for w in bends]]
         return rows.flatten(1, 2), [weights, *scaled]
 
-    @staticmethod
-    def _blended(
-        x: Tensor, rows: Tensor, orders: list[list[Tensor]], tables: list[Tensor]
-    ) -> Tensor:
-        return SplineGrid._blended(x, rows, orders, tables)[..., 2:]
+    @property
+    def grids(self) -> list[bsplines.Grid]:
+        """Of each level."""
+        kind = bsplines.EVEN if self.even else bsplines.PERIODIC
+        return [bsplines.Grid((n, m), 1.0, _DEGREE, kind) for n, m in self._cells]
+
+    def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
+        """Value and both tangents, stacked: (3, N, out_dim)."""
+        return self.blended(x, list(self.tables), tangents=True)
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (N, 2) in any lift to features (N, out_dim)."""
-        return super().forward(x)[..., 2:]
+        return self.blended(x, list(self.tables), tangents=False)[0]

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from nsm.instantiation import target_of
-from nsm.maps.encodings import Identity, pushed_forward, transformed
 from nsm.maps.lattice_grid import LatticeSplineGrid
 from nsm.maps.two_scale import level_cells, level_scale, refined
 
@@ -62,26 +61,14 @@ class MultilevelSpline(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (..., 2) to values (..., ``out_dim``)."""
-        rows, (weights, _, _) = self._finest._seen(x.reshape(-1, 2))
-        blend = (_along(weights, 0)[:, None] * _along(weights, 1)[None]).flatten(0, 1)
-        seen = self.coefficients().index_select(0, rows[0].flatten())
-        out = (blend[:, :, None] * seen.view(*blend.shape, self.out_dim)).sum(dim=0)
-        return out.view(*x.shape[:-1], self.out_dim)
+        return self._read(x, tangents=False)[0]
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Points (..., 2) to values (..., ``out_dim``) and Jacobians (..., ``out_dim``, 2)."""
-        points = x.reshape(-1, 2)
-        if transformed():
-            stack = pushed_forward(self, Identity(2).value_and_jacobian_stack(points))
-        else:
-            with torch.no_grad():
-                rows, orders = self._finest._seen(points)
-            stack = self._finest._blended(points, rows, orders, [self.coefficients()])
-        value, jacobian = stack[0], stack[1:].permute(1, 2, 0)
-        shape = (*x.shape[:-1], self.out_dim)
-        return value.reshape(shape), jacobian.reshape(*shape, 2)
+        value, along, across = self._read(x, tangents=True)
+        return value, torch.stack([along, across], dim=-1)
 
-
-def _along(weights: list[Tensor], axis: int) -> Tensor:
-    """The weights (k, N) along an axis, of one level."""
-    return torch.stack([w[0, axis] for w in weights])
+    def _read(self, x: Tensor, tangents: bool) -> Tensor:
+        """(P, ..., ``out_dim``) at points (..., 2)."""
+        stack = self._finest.blended(x.reshape(-1, 2), [self.coefficients()], tangents)
+        return stack.view(len(stack), *x.shape[:-1], self.out_dim)

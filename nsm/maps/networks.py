@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from nsm.instantiation import check_trusted, made, made_with, target_of
 from nsm.maps.activations import Activation, Softplus, as_activation
+from nsm.maps.bsplines import transformed
 from nsm.maps.encodings import (
     Identity,
     as_encoding,
     pushed_forward,
-    transformed,
     value_and_jacobian_stack,
 )
 from nsm.maps.mlp_with_tangents import MLPWithTangents

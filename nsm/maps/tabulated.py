@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
 from scipy.ndimage import spline_filter1d
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
+from nsm.maps import bsplines
 from nsm.maps.at_points import AtPoints
+from nsm.maps.bsplines import readable
 from nsm.maps.composition import PointMap
-from nsm.maps.encodings import SplineGrid, transformed
+from nsm.maps.encodings import SplineGrid
 from nsm.maps.lattice_grid import LatticeSplineGrid
 
 _EXTENT = 1.05  # half the side of the square that a bounded Ω's table covers
 _AT_ONCE = 8192
 _KEPT = 1 << 18  # points at which Jacobians are remembered
-
-
-class _Read(torch.autograd.Function):
-    """Values of a table, which is not trained, at points; their gradient is by the tangents."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, table: Tabulated) -> Tensor:
-        """(N, 2) to (N, 3)."""
-        value, *tangents = table.stack(x)
-        ctx.save_for_backward(*tangents)
-        return value
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        by = [(gradient * tangent).sum(dim=1) for tangent in ctx.saved_tensors]
-        return torch.stack(by, dim=1), None
 
 
 class Tabulated(nn.Module):
@@ -74,15 +58,15 @@ class Tabulated(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, 2) to (N, 3)."""
-        if x.requires_grad and not transformed() and not torch.compiler.is_compiling():
-            value: Tensor = _Read.apply(x, self)
-            return value
-        return self.grid(x)[..., -self.grid.features :]
+        """(N, 2) to (N, 3), differentiable once on the CPU."""
+        tables = list(self.grid.tables)
+        if readable(x, *tables):
+            return bsplines.read(x, self.grid.grids, tables, tangents=False)[0]
+        return self.grid.blended(x, tables, tangents=False)[0]
 
     def stack(self, x: Tensor) -> Tensor:
         """Values and both tangents at (N, 2), stacked: (3, N, 3)."""
-        return self.grid.value_and_jacobian_stack(x)[..., -self.grid.features :]
+        return self.grid.blended(x, list(self.grid.tables), tangents=True)
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, 3) and Jacobians (N, 3, 2)."""
