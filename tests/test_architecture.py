@@ -23,7 +23,7 @@ ROOMS = [
 # what every room may import
 COMMON = {
     *("compiled", "errors", "instantiation", "optional_dependencies", "settings"),
-    *("side_by_side", "stages", "wording"),
+    *("side_by_side", "stages", "tensors", "wording"),
 }
 # rooms that stand for themselves: meshes in numpy, and maps in torch
 INDEPENDENT = {"maps": {"surfaces"}, "energies": {"surfaces", "maps"}}

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nsm.energies.numerics import widen
+from nsm.energies.compiled_metrics import Form, PullbackInvariants
+from nsm.energies.numerics import GRADIENT_LIMIT, widen
+from nsm.tensors import suit_compiled
 
 # Added to A's diagonal: a source metric this small is a collapsed surface (areas are about π),
 # and larger ones, from 1e-6 up, are altered by less than 1e-6 of themselves.
@@ -47,7 +49,10 @@ def first_fundamental_form(jacobian: Tensor) -> Tensor:
     """
     if jacobian.ndim < 2 or jacobian.shape[-1] != 2:
         raise ValueError(f"a Jacobian is (..., n, 2), not {tuple(jacobian.shape)}")
-    return jacobian.transpose(-1, -2) @ jacobian
+    if suit_compiled(jacobian):
+        form: Tensor = Form.apply(jacobian)
+        return form
+    return jacobian.mT @ jacobian
 
 
 def determinant(matrix: Tensor) -> Tensor:
@@ -77,6 +82,15 @@ def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
     for metric in (source, target):
         if metric.shape[-2:] != (2, 2):
             raise ValueError(f"a metric is (..., 2, 2), not {tuple(metric.shape)}")
+    if source.shape == target.shape and suit_compiled(source, target):
+        plain = _invariants
+        found = PullbackInvariants.apply(source, target, plain, SOURCE_FLOOR, GRADIENT_LIMIT)
+        return Invariants(*found)
+    return Invariants(*_invariants(source, target))
+
+
+def _invariants(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`pullback_invariants`, by operations on tensors."""
     a, b, c = _entries(source)
     e, f, g = _entries(target)
     a, c = a + SOURCE_FLOOR, c + SOURCE_FLOOR
@@ -85,7 +99,7 @@ def pullback_invariants(source: Tensor, target: Tensor) -> Invariants:
     trace = ((c * e - 2 * b * f + a * g) / det_a).clamp(min=0)
     determinant = ((e * g - f * f) / det_a).clamp(min=0)
     # d ≤ t²/4 for every pair of metrics; rounding of a collapsed one must not break it
-    return Invariants(trace, torch.minimum(determinant, trace**2 / 4))
+    return trace, torch.minimum(determinant, trace**2 / 4)
 
 
 def _entries(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,12 +11,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from nsm.maps.bsplines import transformed
 from nsm.maps.composition import LatticeAligned, PointMap, Rotated
 from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
 from nsm.maps.mlp_with_tangents import MLPWithTangents
 from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
 from nsm.maps.planar import IdentityInitializedMap
+from nsm.tensors import transformed
 
 
 class BatchedNetworks(nn.Module):

@@ -42,24 +42,6 @@ class Grid(NamedTuple):
     symmetry: int
 
 
-def transformed() -> bool:
-    """Whether a transform of torch.func is active.
-
-    The operations with a backward pass of their own then give way to plain ones, which all
-    transforms know.
-    """
-    return not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active()
-
-
-def readable(x: Tensor, *tables: Tensor) -> bool:
-    """Whether :func:`read` takes these: real tensors on the CPU, outside all transforms."""
-    if torch.compiler.is_compiling() or transformed():
-        return False
-    return all(
-        t.device.type == "cpu" and t.dtype in (torch.float32, torch.float64) for t in (x, *tables)
-    )
-
-
 def basis(t: Tensor, degree: int) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
     """The degree + 1 weights of the uniform B-spline at offset t in [0, 1), d/dt, and d²/dt²."""
     s = 1 - t
@@ -81,7 +63,7 @@ def read(x: Tensor, grids: Sequence[Grid], tables: Sequence[Tensor], tangents: b
     """Splines at points, differentiable once by the points and by the tables.
 
     Args:
-        x: (N, 2), such that :func:`readable`.
+        x: (N, 2), such that :func:`nsm.tensors.suit_compiled`.
         grids: L of them.
         tables: L of coefficients, (rows, F_l), of one type.
         tangents: whether the derivatives along both axes are wanted, too.

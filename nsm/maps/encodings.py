@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from nsm.errors import NsmError
 from nsm.instantiation import target_of
 from nsm.maps import bsplines
-from nsm.maps.bsplines import basis, readable
+from nsm.maps.bsplines import basis
+from nsm.tensors import suit_compiled
 
 
 class Encoding(Protocol):
@@ -242,7 +243,7 @@ class SplineGrid(nn.Module):
         """Features of all levels at points (N, 2), read off tables like those of the grid:
         (P, N, L · F), P = 1, or 3 with both tangents."""
         once = tangents or not x.requires_grad  # values may be differentiated twice
-        if once and readable(x, *tables):
+        if once and suit_compiled(x, *tables):
             return bsplines.read(x, self.grids, tables, tangents)
         rows, orders = self._seen(x)
         return _summed(rows, orders, tables, tangents)
@@ -258,7 +259,7 @@ class SplineGrid(nn.Module):
             (k, 3, N, out_dim).
         """
         first, points = grids[0], x.flatten(0, 1)
-        if readable(x, *(table for grid in grids for table in grid.tables)):
+        if suit_compiled(x, *(table for grid in grids for table in grid.tables)):
             each = zip(grids, x, strict=True)
             return torch.stack([grid.value_and_jacobian_stack(own) for grid, own in each])
         rows, orders = first._seen(points)

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from nsm.instantiation import check_trusted, made, made_with, target_of
 from nsm.maps.activations import Activation, Softplus, as_activation
-from nsm.maps.bsplines import transformed
 from nsm.maps.encodings import (
     Identity,
     as_encoding,
@@ -21,6 +20,7 @@ from nsm.maps.encodings import (
 from nsm.maps.mlp_with_tangents import MLPWithTangents
 from nsm.maps.multilevel_spline import MultilevelSpline
 from nsm.maps.spline_field import SplineField
+from nsm.tensors import transformed
 
 
 class PostActivationBlock(nn.Module):

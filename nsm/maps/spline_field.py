@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from nsm.instantiation import target_of
 from nsm.maps import bsplines
-from nsm.maps.bsplines import basis, readable
+from nsm.maps.bsplines import basis
+from nsm.tensors import suit_compiled
 
 _DEGREE = 2
 _TAPS = (_DEGREE + 1) ** 2
@@ -120,7 +121,7 @@ class SplineField(nn.Module):
 
     def _read(self, points: Tensor, coefficients: Tensor, tangents: bool) -> Tensor:
         """(P, N, out_dim) at points (N, 2)."""
-        if readable(points, coefficients) and not points.requires_grad:
+        if suit_compiled(points, coefficients) and not points.requires_grad:
             return bsplines.read(points, self.grids, [coefficients], tangents)
         rows, weights = self.seen(points, tangents)  # differentiable more than once
         seen = coefficients.index_select(0, rows.flatten()).view(*rows.shape, -1)

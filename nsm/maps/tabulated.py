@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from nsm.maps import bsplines
 from nsm.maps.at_points import AtPoints
-from nsm.maps.bsplines import readable
 from nsm.maps.composition import PointMap
 from nsm.maps.encodings import SplineGrid
 from nsm.maps.lattice_grid import LatticeSplineGrid
+from nsm.tensors import suit_compiled
 
 _EXTENT = 1.05  # half the side of the square that a bounded Ω's table covers
 _AT_ONCE = 8192
@@ -60,7 +60,7 @@ class Tabulated(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(N, 2) to (N, 3), differentiable once on the CPU."""
         tables = list(self.grid.tables)
-        if readable(x, *tables):
+        if suit_compiled(x, *tables):
             return bsplines.read(x, self.grid.grids, tables, tangents=False)[0]
         return self.grid.blended(x, tables, tangents=False)[0]
 
