@@ -79,6 +79,11 @@ class Placed(nn.Module):
         return x if weight is None else x.to(weight)
 
 
+def _columns_turned(jacobian: Tensor, matrix: Tensor) -> Tensor:
+    """J M of Jacobians (..., N, n, 2) and M (..., 2, 2), as one product of all rows."""
+    return (jacobian.flatten(-3, -2) @ matrix).view(jacobian.shape)
+
+
 class Rotated(nn.Module):
     """x ↦ inner(R x): a fixed rotation of the input, found from the landmarks beforehand.
 
@@ -131,7 +136,7 @@ class Rotated(nn.Module):
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, n) and Jacobians J_inner(R x)·R, (N, n, 2)."""
         value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self.before(x))
-        return value, jacobian @ self.rotation.unsqueeze(-3)
+        return value, _columns_turned(jacobian, self.rotation)
 
 
 class LatticeAligned(nn.Module):
@@ -194,4 +199,4 @@ class LatticeAligned(nn.Module):
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, n) and Jacobians J_inner(B x + c)·B, (N, n, 2)."""
         value, jacobian = cast(PointMap, self.inner).value_and_jacobian(self.before(x))
-        return value, jacobian @ self.matrix.unsqueeze(-3)
+        return value, _columns_turned(jacobian, self.matrix)

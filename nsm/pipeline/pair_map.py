@@ -194,7 +194,7 @@ class PairMapTask(Task):
         """φ and ψ as the training evaluates them."""
         if self.config.trainer.tabulated is None:
             return self.phi.map, self.psi.map
-        return Remembered(self.phi.map), self.tabulated(self.psi)
+        return Remembered(self.tabulated(self.phi)), self.tabulated(self.psi)
 
     def _start(self, p: torch.Tensor, q: torch.Tensor) -> Rotated | LatticeAligned:
         """The rotation, or affine map of the lattice, that h starts from, by landmarks p, q (L, 2)
