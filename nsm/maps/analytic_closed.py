@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nsm.maps.analytic import ANALYTIC, AnalyticSurface, Triple
-from nsm.maps.lattice_grid import into_domain
+from nsm.maps.bsplines import into_domain
 
 _SIDE = 128  # nodes along each side of [-1, 1]²
 _TERMS = 5  # of a theta series; the first one left out is below 1e-17 of the sum

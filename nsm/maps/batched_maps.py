@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from nsm.maps.composition import LatticeAligned, PointMap, Rotated
-from nsm.maps.encodings import SplineGrid, value_and_jacobian_stack
+from nsm.maps.encodings import value_and_jacobian_stack
 from nsm.maps.mlp_with_tangents import MLPWithTangents
 from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
 from nsm.maps.planar import IdentityInitializedMap
@@ -59,10 +59,7 @@ class BatchedNetworks(nn.Module):
         return stack[:, 0], stack[:, 1:].permute(0, 2, 3, 1)
 
     def _encoded(self, x: Tensor) -> Tensor:
-        encodings = [cast(NeuralMap, network).encoding for network in self.networks]
-        if isinstance(encodings[0], SplineGrid):
-            return SplineGrid.batched_stacks(cast(Sequence[SplineGrid], encodings), x)
-        each = zip(encodings, x, strict=True)
+        each = zip((cast(NeuralMap, network).encoding for network in self.networks), x, strict=True)
         return torch.stack([value_and_jacobian_stack(e, points) for e, points in each])
 
 

@@ -2,8 +2,8 @@
 
 A grid's coefficients are the rows of a table (rows, F). A point sees (degree + 1)² of them; the
 value and the derivatives there are sums of these with products of weights along the two axes. On
-the CPU, where each such sum is too small to be worth an operation on tensors, compiled loops read
-all at once (:func:`read`).
+the CPU compiled loops read all at once, as each of some seventy operations on tensors would take
+longer.
 """
 
 from __future__ import annotations
@@ -11,16 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nsm.compiled import compiled
+from nsm.maps import compiled_bsplines as loops
+from nsm.maps.compiled_bsplines import CLAMPED, EVEN, ODD, PERIODIC
+from nsm.tensors import suit_compiled
 
-# what lies beyond the cells: nothing; the grid again; again and turned around; turned and negative
-CLAMPED, PERIODIC, EVEN, ODD = range(4)
-_MOST = 4  # rows along an axis that a point sees, of the highest degree
+__all__ = ["CLAMPED", "EVEN", "ODD", "PERIODIC", "Grid", "read", "read_plainly", "seen"]
 
 
 class Grid(NamedTuple):
@@ -42,28 +41,12 @@ class Grid(NamedTuple):
     symmetry: int
 
 
-def basis(t: Tensor, degree: int) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-    """The degree + 1 weights of the uniform B-spline at offset t in [0, 1), d/dt, and d²/dt²."""
-    s = 1 - t
-    if degree == 2:
-        one = torch.ones_like(t)
-        weights = [0.5 * s * s, 0.5 + t * s, 0.5 * t * t]
-        return weights, [-s, 1 - 2 * t, t], [one, -2 * one, one]
-    weights = [
-        s**3 / 6,
-        (3 * t**3 - 6 * t**2 + 4) / 6,
-        (3 * s**3 - 6 * s**2 + 4) / 6,
-        t**3 / 6,
-    ]
-    slopes = [-0.5 * s**2, 1.5 * t**2 - 2 * t, 2 * s - 1.5 * s**2, 0.5 * t**2]
-    return weights, slopes, [s, 3 * t - 2, 3 * s - 2, t]
-
-
 def read(x: Tensor, grids: Sequence[Grid], tables: Sequence[Tensor], tangents: bool) -> Tensor:
-    """Splines at points, differentiable once by the points and by the tables.
+    """Splines at points: on the CPU by compiled loops, differentiable once; elsewhere, and under
+    transforms, as :func:`read_plainly`.
 
     Args:
-        x: (N, 2), such that :func:`nsm.tensors.suit_compiled`.
+        x: (N, 2).
         grids: L of them.
         tables: L of coefficients, (rows, F_l), of one type.
         tangents: whether the derivatives along both axes are wanted, too.
@@ -71,8 +54,124 @@ def read(x: Tensor, grids: Sequence[Grid], tables: Sequence[Tensor], tangents: b
     Returns:
         (P, N, ΣF_l), P = 1, or 3 with ``tangents``, in the type of the tables.
     """
+    if not suit_compiled(x, *tables):
+        return read_plainly(x, grids, tables, tangents)
     out: Tensor = _Read.apply(x, tuple(grids), tangents, torch.is_grad_enabled(), *tables)
     return out
+
+
+def read_plainly(
+    x: Tensor, grids: Sequence[Grid], tables: Sequence[Tensor], tangents: bool
+) -> Tensor:
+    """As :func:`read`, by operations that all devices and transforms know, and that are
+    differentiable again and again."""
+    parts = []
+    for grid, table in zip(grids, tables, strict=True):
+        rows, weights = _seen_plainly(x, grid)
+        # not an embedding, whose backward pass sorts
+        entries = table.index_select(0, rows.flatten()).view(*rows.shape, table.shape[1])
+        parts.append((weights[: 3 if tangents else 1, ..., None] * entries).sum(dim=2))
+    return torch.cat(parts, dim=-1)
+
+
+def seen(x: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+    """What points see of a grid's table, which its values are linear in.
+
+    Args:
+        x: (N, 2).
+        grid: the grid.
+
+    Returns:
+        Rows (N, k²) of the table, k = degree + 1; and their weights (3, N, k²) in the value and in
+        both tangents.
+    """
+    if x.requires_grad or not suit_compiled(x):
+        return _seen_plainly(x, grid)
+    taps = (grid.degree + 1) ** 2
+    rows = torch.empty(len(x), taps, dtype=torch.int64)
+    weights = torch.empty(3, len(x), taps, dtype=x.dtype)
+    loops.all_seen(x.contiguous().numpy(), *_numbers(grid), rows.numpy(), weights.numpy())
+    return rows, weights
+
+
+def _seen_plainly(x: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+    """As :func:`seen`, by operations on tensors."""
+    periodic, y, sign = grid.symmetry != CLAMPED, x.t(), torch.ones_like(x[:, 0])
+    if periodic:
+        y, sign = into_domain(y, grid.symmetry == EVEN)
+    size = torch.tensor(grid.cells, device=x.device)[:, None]
+    rate = size.to(x.dtype) / (2 * grid.half)
+    z = (y + grid.half) * rate
+    cell = z.detach().floor().nan_to_num(0.0).clamp(min=0).minimum(size.to(x.dtype) - 1)
+    free = z - cell
+    offset = free.clamp(0, 1)
+    within = (offset == free) * rate * sign  # beyond the rim nothing changes
+    values, slopes = basis(offset, grid.degree)
+    w = torch.stack(values, dim=1)  # (2, k, N)
+    d = torch.stack(slopes, dim=1) * within[:, None]
+    taps = torch.arange(grid.degree + 1, device=x.device)[:, None]
+    along = cell.long()[:, None] + (taps - 1 if periodic else taps)
+    if periodic:
+        along = along.remainder(size[:, None])
+    rows = rows_of(along[0, :, None], along[1, None], grid)
+    weights = torch.stack(
+        [u[:, None] * v[None] for u, v in ((w[0], w[1]), (d[0], w[1]), (w[0], d[1]))]
+    )
+    if grid.symmetry == ODD:
+        weights = torch.where(rows < 0, -weights, weights)
+        rows = torch.where(rows < 0, ~rows, rows)
+    return rows.flatten(0, 1).t(), weights.flatten(1, 2).transpose(1, 2)
+
+
+def into_domain(x: Tensor, even: bool) -> tuple[Tensor, Tensor]:
+    """Points moved by Γ into the fundamental domain, differentiable.
+
+    Args:
+        x: (2, N) in any lift.
+        even: whether x ↦ -x is in Γ, beside the translations by 2e₁ and 2e₂.
+
+    Returns:
+        (2, N) in [-1, 1]², in its upper half if ``even``; and signs (N,), -1 for points that were
+        turned.
+    """
+    y = x - 2 * torch.round(x / 2)
+    sign = torch.ones_like(y[0])
+    if even:
+        turned = (y[1] < 0) | ((y[1] == 0) & (y[0] < 0))
+        sign = torch.where(turned, -sign, sign).detach()
+        y = sign * y
+    return y, sign
+
+
+def rows_of(i: Tensor, j: Tensor, grid: Grid) -> Tensor:
+    """Rows (...) of a grid's table for coefficients (i, j), (...) each and in one period; ~r for
+    row r with the sign turned."""
+    n, m = grid.cells
+    if grid.symmetry == CLAMPED:
+        return i * (m + grid.degree) + j
+    if grid.symmetry == EVEN:
+        # x → -x takes (i, j) to (N₁ - 1 - i, N₂ - 1 - j): the upper half stands for both
+        upper = m // 2
+        low = j < upper
+        return torch.where(low, n - 1 - i, i) * upper + torch.where(low, upper - 1 - j, j - upper)
+    rows = i * m + j
+    if grid.symmetry == ODD:
+        return torch.where(rows < n * m // 2, rows, ~(n * m - 1 - rows))
+    return rows
+
+
+def basis(t: Tensor, degree: int) -> tuple[list[Tensor], list[Tensor]]:
+    """The degree + 1 weights of the uniform B-spline at offset t in [0, 1), and d/dt."""
+    s = 1 - t
+    if degree == 2:
+        return [0.5 * s * s, 0.5 + t * s, 0.5 * t * t], [-s, 1 - 2 * t, t]
+    weights = [
+        s**3 / 6,
+        (3 * t**3 - 6 * t**2 + 4) / 6,
+        (3 * s**3 - 6 * s**2 + 4) / 6,
+        t**3 / 6,
+    ]
+    return weights, [-0.5 * s**2, 1.5 * t**2 - 2 * t, 2 * s - 1.5 * s**2, 0.5 * t**2]
 
 
 class _Read(torch.autograd.Function):
@@ -92,7 +191,7 @@ class _Read(torch.autograd.Function):
         out = torch.empty(planes, len(x), width, dtype=tables[0].dtype)
         points, image, column = x.detach().contiguous().numpy(), out.numpy(), 0
         for grid, table in zip(grids, tables, strict=True):
-            _values(points, table.detach().numpy(), *_numbers(grid), image, column)
+            loops.values(points, table.detach().numpy(), *_numbers(grid), image, column)
             column += table.shape[1]
         trained = record and any(ctx.needs_input_grad[4:])
         ctx.save_for_backward(x if trained else None, out[1:] if by_x else None)
@@ -107,13 +206,15 @@ class _Read(torch.autograd.Function):
         by_x = None
         if derivatives is not None:
             by_x = torch.empty(gradient.shape[1], 2, dtype=ctx.kind)
-            _by_points(given, derivatives.numpy(), by_x.numpy())
+            loops.by_points(given, derivatives.numpy(), by_x.numpy())
         by_table: list[Tensor | None] = [None] * len(ctx.shapes)
         column = 0
         for level, (grid, shape) in enumerate(zip(ctx.grids, ctx.shapes, strict=True)):
             if x is not None and ctx.needs_input_grad[4 + level]:
                 total = gradient.new_zeros(shape)
-                _by_table(x.contiguous().numpy(), given, *_numbers(grid), total.numpy(), column)
+                loops.by_table(
+                    x.contiguous().numpy(), given, *_numbers(grid), total.numpy(), column
+                )
                 by_table[level] = total
             column += shape[1]
         return (by_x, None, None, None, *by_table)
@@ -122,171 +223,3 @@ class _Read(torch.autograd.Function):
 def _numbers(grid: Grid) -> tuple[int, int, float, tuple[int, ...], int]:
     # how many taps there are is known when the loops are compiled
     return *grid.cells, grid.half, tuple(range(grid.degree + 1)), grid.symmetry
-
-
-@compiled
-def _weigh(t: float, rate: float, taps: tuple[int, ...], w: np.ndarray) -> None:
-    """The weights (3, k) at offset t: of the value, of d/dx and of d²/dx², where t grows
-    by ``rate`` as x by one."""
-    s, twice = 1 - t, rate * rate
-    if len(taps) == 3:
-        w[0, 0], w[0, 1], w[0, 2] = 0.5 * s * s, 0.5 + t * s, 0.5 * t * t
-        w[1, 0], w[1, 1], w[1, 2] = -s * rate, (1 - 2 * t) * rate, t * rate
-        w[2, 0], w[2, 1], w[2, 2] = twice, -2 * twice, twice
-    else:
-        w[0, 0], w[0, 3] = s**3 / 6, t**3 / 6
-        w[0, 1], w[0, 2] = (3 * t**3 - 6 * t**2 + 4) / 6, (3 * s**3 - 6 * s**2 + 4) / 6
-        w[1, 0], w[1, 3] = -0.5 * s**2 * rate, 0.5 * t**2 * rate
-        w[1, 1], w[1, 2] = (1.5 * t**2 - 2 * t) * rate, (2 * s - 1.5 * s**2) * rate
-        w[2, 0], w[2, 1] = s * twice, (3 * t - 2) * twice
-        w[2, 2], w[2, 3] = (3 * s - 2) * twice, t * twice
-
-
-@compiled
-def _see(
-    u: float,
-    v: float,
-    n: int,
-    m: int,
-    half: float,
-    taps: tuple[int, ...],
-    symmetry: int,
-    along: np.ndarray,
-    w: np.ndarray,
-) -> None:
-    """What a point (u, v) sees: numbers ``along`` (2, k) of coefficients and weights ``w``
-    (2, 3, k), along both axes."""
-    sign = 1.0
-    if symmetry != CLAMPED:
-        u, v = u - 2 * np.floor(u * 0.5 + 0.5), v - 2 * np.floor(v * 0.5 + 0.5)
-        if symmetry == EVEN and (v < 0 or (v == 0 and u < 0)):
-            u, v, sign = -u, -v, -1.0
-    for axis in range(2):
-        size = n if axis == 0 else m
-        rate = size / (2 * half)
-        z = ((u if axis == 0 else v) + half) * rate
-        cell = 0  # of points that are not numbers, too
-        if z > 0:
-            cell = int(z) if z < size else size - 1
-        t, within = z - cell, 1.0
-        if symmetry == CLAMPED and (t < 0 or t > 1):  # beyond the rim nothing changes
-            t, within = 0.0 if t < 0 else 1.0, 0.0
-        _weigh(t, within * rate * sign, taps, w[axis])
-        for k in range(len(taps)):
-            if symmetry == CLAMPED:
-                along[axis, k] = cell + k
-            else:
-                i = cell + k - 1
-                along[axis, k] = i + size if i < 0 else (i - size if i >= size else i)
-
-
-@compiled
-def _row(i: int, j: int, n: int, m: int, taps: tuple[int, ...], symmetry: int) -> int:
-    """The row of coefficient (i, j); ~r for row r with the sign turned."""
-    if symmetry == CLAMPED:
-        return i * (m + len(taps) - 1) + j
-    if symmetry == EVEN:
-        upper = m // 2
-        if j < upper:
-            return (n - 1 - i) * upper + upper - 1 - j
-        return i * upper + j - upper
-    row = i * m + j
-    if symmetry == ODD and row >= n * m // 2:
-        return ~(n * m - 1 - row)
-    return row
-
-
-@compiled
-def _values(
-    x: np.ndarray,
-    table: np.ndarray,
-    n: int,
-    m: int,
-    half: float,
-    taps: tuple[int, ...],
-    symmetry: int,
-    out: np.ndarray,
-    column: int,
-) -> None:
-    """Value, ∂u, ∂v, ∂uu, ∂uv, ∂vv at x (N, 2), as many as ``out`` (P, N, ·) has planes, from
-    ``column`` on."""
-    along, w = np.empty((2, _MOST), np.int64), np.empty((2, 3, _MOST))
-    rows = np.empty((_MOST, _MOST), np.int64)
-    planes, width = len(out), table.shape[1]
-    for p in range(len(x)):
-        _see(x[p, 0], x[p, 1], n, m, half, taps, symmetry, along, w)
-        for a in range(len(taps)):
-            for b in range(len(taps)):
-                rows[a, b] = _row(along[0, a], along[1, b], n, m, taps, symmetry)
-        for c in range(width):
-            f = fu = fv = fuu = fuv = fvv = 0.0
-            for a in range(len(taps)):
-                value = slope = bend = 0.0
-                for b in range(len(taps)):
-                    row = rows[a, b]
-                    entry = table[row, c] if row >= 0 else -table[~row, c]
-                    value += w[1, 0, b] * entry
-                    slope += w[1, 1, b] * entry
-                    bend += w[1, 2, b] * entry
-                f += w[0, 0, a] * value
-                fu += w[0, 1, a] * value
-                fv += w[0, 0, a] * slope
-                fuu += w[0, 2, a] * value
-                fuv += w[0, 1, a] * slope
-                fvv += w[0, 0, a] * bend
-            out[0, p, column + c] = f
-            if planes > 1:
-                out[1, p, column + c] = fu
-                out[2, p, column + c] = fv
-            if planes > 3:
-                out[3, p, column + c] = fuu
-                out[4, p, column + c] = fuv
-                out[5, p, column + c] = fvv
-
-
-@compiled
-def _by_table(
-    x: np.ndarray,
-    gradient: np.ndarray,
-    n: int,
-    m: int,
-    half: float,
-    taps: tuple[int, ...],
-    symmetry: int,
-    total: np.ndarray,
-    column: int,
-) -> None:
-    """Add to ``total`` (rows, F) the gradient by the table, of one by the values (P, N, ·)."""
-    along, w = np.empty((2, _MOST), np.int64), np.empty((2, 3, _MOST))
-    planes, width = len(gradient), total.shape[1]
-    for p in range(len(x)):
-        _see(x[p, 0], x[p, 1], n, m, half, taps, symmetry, along, w)
-        for a in range(len(taps)):
-            for b in range(len(taps)):
-                row, sign = _row(along[0, a], along[1, b], n, m, taps, symmetry), 1.0
-                if row < 0:
-                    row, sign = ~row, -1.0
-                of_value = sign * w[0, 0, a] * w[1, 0, b]
-                of_u, of_v = sign * w[0, 1, a] * w[1, 0, b], sign * w[0, 0, a] * w[1, 1, b]
-                for c in range(width):
-                    share = of_value * gradient[0, p, column + c]
-                    if planes > 1:
-                        share += of_u * gradient[1, p, column + c]
-                        share += of_v * gradient[2, p, column + c]
-                    total[row, c] += share
-
-
-@compiled
-def _by_points(gradient: np.ndarray, derivatives: np.ndarray, out: np.ndarray) -> None:
-    """The gradient (N, 2) by the points, of one by the values (P, N, F): P is 1 or 3;
-    ``derivatives`` (2 or 5, N, F) are ∂u, ∂v, ∂uu, ∂uv, ∂vv there."""
-    for p in range(gradient.shape[1]):
-        by_u, by_v = 0.0, 0.0
-        for c in range(gradient.shape[2]):
-            by_u += gradient[0, p, c] * derivatives[0, p, c]
-            by_v += gradient[0, p, c] * derivatives[1, p, c]
-            if len(gradient) > 1:
-                along, across = gradient[1, p, c], gradient[2, p, c]
-                by_u += along * derivatives[2, p, c] + across * derivatives[3, p, c]
-                by_v += along * derivatives[3, p, c] + across * derivatives[4, p, c]
-        out[p, 0], out[p, 1] = by_u, by_v

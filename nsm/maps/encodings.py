@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from nsm.errors import NsmError
 from nsm.instantiation import target_of
 from nsm.maps import bsplines
-from nsm.maps.bsplines import basis
-from nsm.tensors import suit_compiled
 
 
 class Encoding(Protocol):
@@ -187,26 +185,11 @@ class SplineGrid(nn.Module):
         )
         self.out_dim = in_dim + features * len(self.resolutions)
 
-    def _seen(
-        self, x: Tensor, resolutions: Sequence[int] | None = None
-    ) -> tuple[Tensor, list[list[Tensor]]]:
-        """Of all levels, or those of some resolutions: rows (L, k², N) of the tables that points
-        (N, 2) see, and the weights (L, 2, N) of the k rows along each axis, with their first and
-        second derivatives by x."""
-        size = torch.tensor(resolutions or self.resolutions, device=x.device)[:, None, None]
-        per_unit = size.to(x.dtype) / (2 * self.extent)
-        z = (x.t() + self.extent) * per_unit
-        cell = z.detach().floor().clamp(min=0).minimum(size.to(x.dtype) - 1)
-        free = z - cell
-        offset = free.clamp(0, 1)
-        within = (offset == free) * per_unit  # beyond the rim nothing changes
-        weights, slopes, bends = basis(offset, self.degree)
-        step = torch.arange(self.degree + 1, device=x.device)[:, None]
-        corner = cell.long()
-        across = (corner[:, 0, None] + step) * (size + self.degree)
-        rows = across[:, :, None] + (corner[:, 1, None] + step)[:, None]
-        scaled = [[w * within for w in slopes], [w * within * within for w in bends]]
-        return rows.flatten(1, 2), [weights, *scaled]
+    @property
+    def grids(self) -> list[bsplines.Grid]:
+        """Of each level."""
+        kind = bsplines.CLAMPED
+        return [bsplines.Grid((r, r), self.extent, self.degree, kind) for r in self.resolutions]
 
     def seen(self, x: Tensor, level: int) -> tuple[Tensor, Tensor]:
         """What points see of a level's table, which its features are linear in.
@@ -218,87 +201,18 @@ class SplineGrid(nn.Module):
         Returns:
             rows (N, k²) of the table; their weights (3, N, k²) in value and both tangents.
         """
-        rows, orders = self._seen(x, self.resolutions[level : level + 1])
-        value, first, _ = (torch.stack(w, dim=2)[0] for w in orders)
-        pairs = ((value, value), (first, value), (value, first))
-        blend = torch.stack([(u[0, :, None] * v[1, None]).flatten(0, 1) for u, v in pairs])
-        return rows[0].t(), blend.transpose(1, 2)
-
-    def first_row(self, x: Tensor, level: int) -> Tensor:
-        """The first row (N,) of a level's table that each of points (N, 2) sees."""
-        return self._seen(x, self.resolutions[level : level + 1])[0][0, 0]
+        return bsplines.seen(x, self.grids[level])
 
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""
         unit = Identity(2).value_and_jacobian_stack(x)
         return torch.cat([unit, self.blended(x, list(self.tables), tangents=True)], dim=-1)
 
-    @property
-    def grids(self) -> list[bsplines.Grid]:
-        """Of each level."""
-        kind = bsplines.CLAMPED
-        return [bsplines.Grid((r, r), self.extent, self.degree, kind) for r in self.resolutions]
-
     def blended(self, x: Tensor, tables: Sequence[Tensor], tangents: bool) -> Tensor:
         """Features of all levels at points (N, 2), read off tables like those of the grid:
-        (P, N, L · F), P = 1, or 3 with both tangents."""
-        once = tangents or not x.requires_grad  # values may be differentiated twice
-        if once and suit_compiled(x, *tables):
-            return bsplines.read(x, self.grids, tables, tangents)
-        rows, orders = self._seen(x)
-        return _summed(rows, orders, tables, tangents)
-
-    @classmethod
-    def batched_stacks(cls, grids: Sequence[SplineGrid], x: Tensor) -> Tensor:
-        """Values and both tangents of k grids of one configuration, each at points of its own.
-
-        Args:
-            x: (k, N, 2).
-
-        Returns:
-            (k, 3, N, out_dim).
-        """
-        first, points = grids[0], x.flatten(0, 1)
-        if suit_compiled(x, *(table for grid in grids for table in grid.tables)):
-            each = zip(grids, x, strict=True)
-            return torch.stack([grid.value_and_jacobian_stack(own) for grid, own in each])
-        rows, orders = first._seen(points)
-        lengths = [len(table) for table in first.tables]
-        # the features of a level lie one grid below the other
-        offsets = torch.tensor(lengths, device=x.device)[:, None] * torch.arange(
-            len(grids), device=x.device
-        )
-        rows = rows + offsets.repeat_interleave(x.shape[1], dim=1)[:, None]
-        tables = [torch.cat(level) for level in zip(*(g.tables for g in grids), strict=True)]
-        stack = _summed(rows, orders, tables, tangents=True)
-        if first.out_dim > stack.shape[-1]:  # x itself is a feature
-            stack = torch.cat([Identity(2).value_and_jacobian_stack(points), stack], dim=-1)
-        return stack.view(3, *x.shape[:2], -1).transpose(0, 1)
+        (P, N, L · F), P = 1, or 3 with both tangents. Values alone are differentiable twice."""
+        twice = x.requires_grad and not tangents
+        return (bsplines.read_plainly if twice else bsplines.read)(x, self.grids, tables, tangents)
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.cat([x, self.blended(x, list(self.tables), tangents=False)[0]], dim=-1)
-
-
-def _summed(
-    rows: Tensor, orders: list[list[Tensor]], tables: Sequence[Tensor], tangents: bool
-) -> Tensor:
-    """Features blended by plain operations, which all devices and transforms know.
-
-    Args:
-        rows: (L, k², N) of the tables that N points see.
-        orders: weights (L, 2, N) of the k rows along each axis, and their first derivatives.
-        tables: L, (rows, F) each.
-        tangents: whether both are wanted.
-
-    Returns:
-        (P, N, L · F), P = 1 or 3.
-    """
-    w, d = (torch.stack(order, dim=2) for order in orders[:2])  # (L, 2, k, N)
-    pairs = [(w, w), (d, w), (w, d)] if tangents else [(w, w)]
-    blend = torch.stack([(u[:, 0, :, None] * v[:, 1, None]).flatten(1, 2) for u, v in pairs])
-    parts = []
-    for level, table in enumerate(tables):
-        # not an embedding, whose backward pass sorts
-        seen = table.index_select(0, rows[level].flatten()).view(*rows.shape[1:], -1)
-        parts.append((blend[:, level, ..., None] * seen).sum(dim=1))
-    return torch.cat(parts, dim=-1)

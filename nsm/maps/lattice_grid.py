@@ -8,31 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from nsm.maps import bsplines
-from nsm.maps.bsplines import basis
 from nsm.maps.encodings import SplineGrid, _config
 
 _DEGREE = 2
 _TAPS = torch.arange(-1, 2)
-
-
-def into_domain(x: Tensor, even: bool) -> tuple[Tensor, Tensor]:
-    """Points moved by Γ into the fundamental domain, differentiable.
-
-    Args:
-        x: (2, N) in any lift.
-        even: whether x ↦ -x is in Γ, beside the translations by 2e₁ and 2e₂.
-
-    Returns:
-        (2, N) in [-1, 1]², in its upper half if ``even``; and signs (N,), -1 for points that were
-        turned.
-    """
-    y = x - 2 * torch.round(x / 2)
-    sign = torch.ones_like(y[0])
-    if even:
-        turned = (y[1] < 0) | ((y[1] == 0) & (y[0] < 0))
-        sign = torch.where(turned, -sign, sign).detach()
-        y = sign * y
-    return y, sign
 
 
 class LatticeSplineGrid(SplineGrid):
@@ -78,24 +57,20 @@ class LatticeSplineGrid(SplineGrid):
         n, m = self._cells[level]
         return n, m
 
-    def rows_of(self, i: Tensor, j: Tensor, cells: Tensor) -> Tensor:
+    def rows_of(self, i: Tensor, j: Tensor, cells: tuple[int, int]) -> Tensor:
         """Rows (...) of a table for coefficients (i, j), any integers (...), of a grid of cells
-        (..., 2)."""
-        return self._rows(
-            torch.remainder(i, cells[..., 0]), torch.remainder(j, cells[..., 1]), cells
-        )
+        (N₁, N₂)."""
+        grid = self._grid(cells)
+        return bsplines.rows_of(torch.remainder(i, cells[0]), torch.remainder(j, cells[1]), grid)
 
-    def _rows(self, i: Tensor, j: Tensor, cells: Tensor) -> Tensor:
-        """As :meth:`rows_of`, of coefficients in one period."""
-        n, m = cells[..., 0], cells[..., 1]
-        if not self.even:
-            return i * m + j
-        # x → -x takes (i, j) to (N₁ - 1 - i, N₂ - 1 - j): the upper half stands for both
-        half = m // 2
-        low, above = j < half, i * half
-        return torch.where(low, (n - 1) * half - above, above) + torch.where(
-            low, half - 1 - j, j - half
-        )
+    def _grid(self, cells: tuple[int, int]) -> bsplines.Grid:
+        kind = bsplines.EVEN if self.even else bsplines.PERIODIC
+        return bsplines.Grid(cells, 1.0, _DEGREE, kind)
+
+    @property
+    def grids(self) -> list[bsplines.Grid]:
+        """Of each level."""
+        return [self._grid((n, m)) for n, m in self._cells]
 
     def cell_rows(self, level: int) -> Tensor:
         """Rows (rows, 9) that the points of each cell of Ω see; the cell of row r is number r."""
@@ -104,33 +79,7 @@ class LatticeSplineGrid(SplineGrid):
             torch.arange(n), torch.arange(m // 2 if self.even else 0, m), indexing="ij"
         )
         i, j = i.reshape(-1, 1, 1) + _TAPS[:, None], j.reshape(-1, 1, 1) + _TAPS
-        return self.rows_of(i, j, torch.tensor([n, m])).flatten(1)
-
-    def _seen(
-        self, x: Tensor, resolutions: Sequence[int] | None = None
-    ) -> tuple[Tensor, list[list[Tensor]]]:
-        """As :meth:`SplineGrid._seen`."""
-        cells = torch.tensor(resolutions or self.resolutions, device=x.device)  # (L, 2)
-        y, sign = into_domain(x.t(), self.even)
-        size = cells[:, :, None].to(x.dtype)
-        z = (y + 1) * (0.5 * size)
-        cell = z.detach().floor().clamp(min=0).minimum(size - 1)
-        weights, slopes, bends = basis(z - cell, _DEGREE)
-        corner, side = cell.long(), cells[:, :, None]
-        # the cell itself and those beside it, around the period; cheaper than remainders
-        before = torch.where(corner == 0, side, corner) - 1
-        after = torch.where(corner == side - 1, 0, corner + 1)
-        taps = torch.stack([before, corner, after], dim=2)
-        rows = self._rows(taps[:, 0, :, None], taps[:, 1, None], cells[:, None, None, None])
-        rate = 0.5 * size * sign
-        scaled = [[w * rate for w in slopes], [w * rate * rate for w in bends]]
-        return rows.flatten(1, 2), [weights, *scaled]
-
-    @property
-    def grids(self) -> list[bsplines.Grid]:
-        """Of each level."""
-        kind = bsplines.EVEN if self.even else bsplines.PERIODIC
-        return [bsplines.Grid((n, m), 1.0, _DEGREE, kind) for n, m in self._cells]
+        return self.rows_of(i, j, (n, m)).flatten(1)
 
     def value_and_jacobian_stack(self, x: Tensor) -> Tensor:
         """Value and both tangents, stacked: (3, N, out_dim)."""

@@ -11,11 +11,8 @@ from torch import Tensor, nn
 
 from nsm.instantiation import target_of
 from nsm.maps import bsplines
-from nsm.maps.bsplines import basis
-from nsm.tensors import suit_compiled
 
 _DEGREE = 2
-_TAPS = (_DEGREE + 1) ** 2
 
 
 class SplineField(nn.Module):
@@ -75,28 +72,8 @@ class SplineField(nn.Module):
             Rows (N, 9), and their weights (P, N, 9) for the value and, with ``tangents``, for both
             derivatives: P is 1 or 3.
         """
-        cells = self.cells
-        z = (x.t() + 1) * (0.5 * cells)
-        cell = z.detach().floor()
-        if not self.periodic:
-            cell = cell.clamp(0, cells - 1)
-        free = z - cell
-        offset = free.clamp(0, 1)
-        w, slopes, _ = (torch.stack(order, dim=-1) for order in basis(offset, _DEGREE))
-        along = cell.long()[..., None] + torch.arange(_DEGREE + 1, device=x.device)
-        if self.periodic:
-            along = (along - 1).remainder(cells)
-        rows = along[0, :, :, None] * self.side + along[1, :, None, :]
-        orders = [(w[0], w[1])]
-        if tangents:  # beyond the rim nothing changes
-            d = slopes * ((offset == free) * (0.5 * cells))[..., None]
-            orders += [(d[0], w[1]), (w[0], d[1])]
-        weights = torch.stack([u[:, :, None] * v[:, None, :] for u, v in orders])
-        if self.odd:  # the second half of the coefficients is the first, turned and negative
-            turned = rows >= self.side**2 // 2
-            rows = torch.where(turned, self.side**2 - 1 - rows, rows)
-            weights = torch.where(turned, -weights, weights)
-        return rows.flatten(1), weights.flatten(2)
+        rows, weights = bsplines.seen(x, self.grids[0])
+        return rows, weights[: 3 if tangents else 1]
 
     @contextmanager
     def watched(self) -> Iterator[list[tuple[Tensor, Tensor]]]:
@@ -121,11 +98,9 @@ class SplineField(nn.Module):
 
     def _read(self, points: Tensor, coefficients: Tensor, tangents: bool) -> Tensor:
         """(P, N, out_dim) at points (N, 2)."""
-        if suit_compiled(points, coefficients) and not points.requires_grad:
-            return bsplines.read(points, self.grids, [coefficients], tangents)
-        rows, weights = self.seen(points, tangents)  # differentiable more than once
-        seen = coefficients.index_select(0, rows.flatten()).view(*rows.shape, -1)
-        return (weights[..., None] * seen).sum(dim=-2)
+        by_points = points.requires_grad  # which may be differentiated twice
+        read = bsplines.read_plainly if by_points else bsplines.read
+        return read(points, self.grids, [coefficients], tangents)
 
     def forward(self, x: Tensor) -> Tensor:
         """Points (..., 2) to values (..., out_dim)."""

@@ -14,7 +14,6 @@ from nsm.maps.at_points import AtPoints
 from nsm.maps.composition import PointMap
 from nsm.maps.encodings import SplineGrid
 from nsm.maps.lattice_grid import LatticeSplineGrid
-from nsm.tensors import suit_compiled
 
 _EXTENT = 1.05  # half the side of the square that a bounded Ω's table covers
 _AT_ONCE = 8192
@@ -58,15 +57,12 @@ class Tabulated(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, 2) to (N, 3), differentiable once on the CPU."""
-        tables = list(self.grid.tables)
-        if suit_compiled(x, *tables):
-            return bsplines.read(x, self.grid.grids, tables, tangents=False)[0]
-        return self.grid.blended(x, tables, tangents=False)[0]
+        """(N, 2) to (N, 3)."""
+        return bsplines.read(x, self.grid.grids, list(self.grid.tables), tangents=False)[0]
 
     def stack(self, x: Tensor) -> Tensor:
         """Values and both tangents at (N, 2), stacked: (3, N, 3)."""
-        return self.grid.blended(x, list(self.grid.tables), tangents=True)
+        return bsplines.read(x, self.grid.grids, list(self.grid.tables), tangents=True)
 
     def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) to the values (N, 3) and Jacobians (N, 3, 2)."""

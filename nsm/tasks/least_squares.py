@@ -158,7 +158,7 @@ def _fit_tables(
     nn.init.zeros_(linear_skip.weight)
     nn.init.zeros_(linear_skip.bias)
     # neighbours follow each other: what they see of a table, and add to, is near in memory
-    order = grid.first_row(uv, len(grid.tables) - 1).argsort()
+    order = grid.seen(uv, len(grid.tables) - 1)[0][:, 0].argsort()
     uv, along, left = uv[order], along[..., order], target[..., order]
     column = grid.out_dim - grid.features * len(grid.tables)  # past x itself, if it is a feature
     for level, table in enumerate(grid.tables):
@@ -284,8 +284,7 @@ def _on_lattice(
     nearby = torch.arange(1 - taps, taps, dtype=torch.int32)
     down = torch.arange(n, dtype=torch.int32)[:, None, None, None] + nearby[:, None]
     across = torch.arange(low, m, dtype=torch.int32)[:, None, None] + nearby
-    cells = torch.tensor([n, m], dtype=torch.int32)
-    columns = grid.rows_of(down, across, cells).reshape(size, -1).numpy()
+    columns = grid.rows_of(down, across, (n, m)).reshape(size, -1).numpy()
     values = np.stack(list(entries.values()), axis=1)
     # near a cone, some neighbours of a coefficient are the coefficient itself
     weight = values[columns == np.arange(size)[:, None]].sum() / size

@@ -121,7 +121,7 @@ def lattice_refinements(grid: LatticeSplineGrid, level: int) -> list[csr_matrix]
 def folding(grid: LatticeSplineGrid, n: int, m: int) -> csr_matrix:
     """From a table of n by m cells (rows) to all coefficients (n·m) of the periodic grid."""
     i, j = torch.meshgrid(torch.arange(n), torch.arange(m), indexing="ij")
-    rows = grid.rows_of(i, j, torch.tensor([n, m])).flatten().numpy()
+    rows = grid.rows_of(i, j, (n, m)).flatten().numpy()
     ones = np.ones(n * m)
     return csr_matrix((ones, (np.arange(n * m), rows)), shape=(n * m, int(rows.max()) + 1))
 

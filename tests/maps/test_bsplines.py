@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nsm.maps import LatticeSplineGrid, SplineField, SplineGrid
-from nsm.maps.bsplines import read
+from nsm.maps.bsplines import read, read_plainly, seen
 from nsm.tensors import suit_compiled
 
 
@@ -34,25 +34,13 @@ def points(count=60, reach=1.4, dtype=torch.float64):
     return (reach * (2 * torch.rand(count, 2, dtype=torch.float64) - 1)).to(dtype)
 
 
-def plainly(grid, x, tables, tangents):
-    """By the operations of tensors that other devices use."""
-    if isinstance(grid, SplineField):
-        rows, weights = grid.seen(x, tangents)
-        return (weights[..., None] * tables[0][rows]).sum(dim=-2)
-    parts = []
-    for level, table in enumerate(tables):
-        rows, weights = grid.seen(x, level)
-        parts.append((weights[: 3 if tangents else 1, ..., None] * table[rows]).sum(dim=-2))
-    return torch.cat(parts, dim=-1)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_values_and_gradients_are_those_of_plain_operations(kind):
-    grid, grids, tables = made(kind)
+    _, grids, tables = made(kind)
     for tangents in (False, True):
         x, y = (points().requires_grad_() for _ in range(2))
         y.data = x.data.clone()
-        found, plain = read(x, grids, tables, tangents), plainly(grid, y, tables, tangents)
+        found, plain = read(x, grids, tables, tangents), read_plainly(y, grids, tables, tangents)
         torch.testing.assert_close(found, plain)
         given = torch.randn_like(plain)
         for by, same in zip(
@@ -94,12 +82,32 @@ def test_points_that_are_not_finite_read_nothing_beyond_the_table(kind):
     assert values[:, 3].isfinite().all()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_points_see(kind):
+    _, grids, tables = made(kind)
+    for grid, table in zip(grids, tables, strict=True):
+        x = points()
+        rows, weights = seen(x, grid)
+        torch.testing.assert_close(
+            (weights[..., None] * table[rows]).sum(dim=2), read(x, [grid], [table], True)
+        )
+        plain_rows, plain_weights = seen(x.requires_grad_(), grid)
+        assert torch.equal(rows, plain_rows)
+        torch.testing.assert_close(weights, plain_weights)
+
+
 def test_single_precision_points_and_tables():
-    grid, grids, tables = made("periodic", torch.float32)
+    _, grids, tables = made("periodic", torch.float32)
     x = points(dtype=torch.float32)
     found = read(x, grids, tables, True)
     assert found.dtype == torch.float32
-    torch.testing.assert_close(found, plainly(grid, x, tables, True), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(found, read_plainly(x, grids, tables, True), atol=1e-4, rtol=1e-4)
+
+
+def test_values_are_differentiable_twice():
+    for kind in ("clamped", "cubic", "periodic"):
+        grid, _, _ = made(kind)
+        assert torch.autograd.gradgradcheck(grid, (points(4, reach=0.9).requires_grad_(),))
 
 
 def test_transforms_and_other_types_take_plain_operations():
