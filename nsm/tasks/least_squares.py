@@ -12,7 +12,6 @@ this is Eq. 1 (METHOD) made linear.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from typing import Any, cast
@@ -22,10 +21,11 @@ import torch
 from scipy.sparse import csr_matrix, dia_matrix, diags, identity, kron, triu
 from torch import Tensor, nn
 
+from nsm.compiled import compiled
 from nsm.data import SurfaceSampler
 from nsm.domains import Surface
 from nsm.instantiation import target_of
-from nsm.maps import LatticeSplineGrid, LinearInFeatures, NeuralMap, build_network
+from nsm.maps import LatticeSplineGrid, LinearInFeatures, NeuralMap, bsplines, build_network
 from nsm.maps.encodings import Encoding, SplineGrid, value_and_jacobian_stack
 from nsm.stages import at
 from nsm.tasks.multigrid import lattice_refinements, solve, solve_through
@@ -166,26 +166,14 @@ def _fit_tables(
         enough = order < max(_FEWEST, _SAMPLES * len(table))
         some = (part if enough.all() else part[..., enough] for part in (uv.t(), along, left))
         found = torch.as_tensor(_best(grid, level, *some)).to(left)
-        behind = len(uv) if level + 1 < len(grid.tables) else 0
-        for part, rows, weights in _seen(grid, level, uv.t()[:, :behind], along):
-            for k, coefficients in enumerate(found.t()):
-                left[:, k, part] -= (weights * coefficients[rows]).sum(dim=1)
+        if level + 1 < len(grid.tables):
+            part = bsplines.read(uv, grid.grids[level : level + 1], [found], tangents=True)
+            left -= _rows(part.mT, along)
         # tables of entries about 1, which steps of one rate suit
         scale = float(found.square().mean().sqrt().clamp(min=1e-30))
         table[:, :size] = found / scale
         linear_skip.weight[:, column : column + size] = scale * torch.eye(size)
         column += grid.features
-
-
-def _seen(
-    grid: SplineGrid, level: int, uv: Tensor, along: Tensor
-) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Which samples, the rows (k², n) that they see of a level's table, and the weights (3, k², n)
-    of these in the value and in the derivatives along the surface; part by part."""
-    for start in range(0, uv.shape[1], _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
-        rows, weights = grid.seen(uv[:, part].t(), level)
-        yield part, rows.t(), _rows(weights.transpose(1, 2), along[..., part])
 
 
 def _best(grid: SplineGrid, level: int, uv: Tensor, along: Tensor, target: Tensor) -> np.ndarray:
@@ -210,21 +198,53 @@ def _sums(
     Args:
         cell: which of the rows that a sample sees has the number of its cell.
     """
-    rows, taps, columns = len(grid.tables[level]), (grid.degree + 1) ** 2, target.shape[1]
-    pairs = _pairs(taps)
-    products, wanted = np.zeros((len(pairs), rows)), np.zeros((taps, columns, rows))
-    for part, seen, weights in _seen(grid, level, uv, along):
-        of = seen[cell].numpy()
-        there = slice(of.min(), of.max() + 1)
-        of = of - there.start
-        for total, (a, b) in zip(products, pairs, strict=True):
-            total[there] += np.bincount(of, (weights[:, a] * weights[:, b]).sum(dim=0).numpy())
-        wished = target[..., part]
+    count, taps, columns = len(grid.tables[level]), (grid.degree + 1) ** 2, target.shape[1]
+    products = np.zeros((count, len(_pairs(taps))))
+    wanted = np.zeros((count, taps, columns))
+    for start in range(0, uv.shape[1], _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        rows, weights = grid.seen(uv[:, part].t(), level)
+        wished = target[..., part].contiguous().numpy()
+        turned = along[..., part].contiguous().numpy()
+        _add_up(rows[:, cell].numpy(), weights.numpy(), turned, wished, products, wanted)
+    return np.ascontiguousarray(products.T), np.ascontiguousarray(wanted.transpose(1, 2, 0))
+
+
+@compiled
+def _add_up(
+    of: np.ndarray,
+    weights: np.ndarray,
+    along: np.ndarray,
+    target: np.ndarray,
+    products: np.ndarray,
+    wanted: np.ndarray,
+) -> None:
+    """Add what samples see to the sums of their cells.
+
+    Args:
+        of: (n,) cells.
+        weights: (3, n, k²) in the value and in the derivatives by u and v.
+        along: (2, 2, n), which turns these into derivatives along the surface.
+        target: (3, columns, n), the value and the derivatives along the surface.
+        products: (rows, k² (k² + 1) / 2).
+        wanted: (rows, k², columns).
+    """
+    taps, columns = weights.shape[2], target.shape[1]
+    w = np.empty((3, taps))
+    for p in range(len(of)):
+        cell, pair = of[p], 0
         for a in range(taps):
+            by_u, by_v = weights[1, p, a], weights[2, p, a]
+            w[0, a] = weights[0, p, a]
+            w[1, a] = by_u * along[0, 0, p] + by_v * along[1, 0, p]
+            w[2, a] = by_u * along[0, 1, p] + by_v * along[1, 1, p]
+        for a in range(taps):
+            for b in range(a, taps):
+                products[cell, pair] += w[0, a] * w[0, b] + w[1, a] * w[1, b] + w[2, a] * w[2, b]
+                pair += 1
             for c in range(columns):
-                term = (weights[:, a] * wished[:, c]).sum(dim=0)
-                wanted[a, c, there] += np.bincount(of, term.numpy())
-    return products, wanted
+                for k in range(3):
+                    wanted[cell, a, c] += w[k, a] * target[k, c, p]
 
 
 def _pairs(taps: int) -> list[tuple[int, int]]:
