@@ -11,6 +11,7 @@ from scipy.sparse import csc_matrix, csr_matrix, diags, identity, kron
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from nsm.compiled import compiled
 from nsm.maps import SplineField
 from nsm.tasks.dissection import nested_dissection
 from nsm.tasks.multigrid import refinement_along
@@ -87,7 +88,6 @@ class Level:
             d matrices (rows, rows).
         """
         rows, weights = self.grid.seen(x.cpu().double(), tangents=True)
-        w = weights.permute(1, 0, 2)  # (N, 3, 9)
         # points of a cell see the same coefficients
         key = (rows * (torch.arange(1, 10) * _HASH)).sum(dim=1)
         _, cell = key.unique(return_inverse=True)
@@ -99,11 +99,28 @@ class Level:
         j = np.tile(of_cell, (1, 9)).ravel()
         result = []
         for block in blocks.cpu().double():
-            local = (w.mT @ block @ w).flatten(1)
-            entries = torch.zeros(count, 81, dtype=torch.float64).index_add_(0, cell, local)
+            entries = np.zeros((count, 9, 9))
+            _add_up(cell.numpy(), weights.numpy(), block.contiguous().numpy(), entries)
             shape = (self.rows, self.rows)
-            result.append(csr_matrix((entries.numpy().ravel(), (i, j)), shape=shape).tocsc())
+            result.append(csr_matrix((entries.ravel(), (i, j)), shape=shape).tocsc())
         return result
+
+
+@compiled
+def _add_up(cell: np.ndarray, weights: np.ndarray, block: np.ndarray, entries: np.ndarray) -> None:
+    """Add Wᵀ H W of each point, weights (3, N, 9) and H (N, 3, 3), to the entries (cells, 9, 9) of
+    its cell (N,)."""
+    seen = np.empty((3, 9))
+    for p in range(len(cell)):
+        for a in range(3):
+            for k in range(9):
+                seen[a, k] = 0.0
+                for b in range(3):
+                    seen[a, k] += block[p, a, b] * weights[b, p, k]
+        for k in range(9):
+            for m in range(9):
+                for a in range(3):
+                    entries[cell[p], k, m] += weights[a, p, k] * seen[a, m]
 
 
 class Metric:
