@@ -29,28 +29,27 @@ class Turn(NamedTuple):
         number: i.
         some: F triangles in the common domain; their metric is that of their surface, their share
             that of its area divided by the number of surfaces.
-        of: (M,) the triangle of each map of a triangle that h_i has a part in.
-        outward: (M,) whether that map begins at surface i.
+        of: (M,) the triangle of each map of a triangle that h_i has a part in: first of the maps
+            to surface i, then of those from it.
+        inward: how many of them lead to surface i.
         held: (M, 2, 2) metric of its other end.
         at: its beginning.
+        share: (M,) of the surface's area.
     """
 
     number: int
     some: Triangles
     of: Tensor
-    outward: Tensor
+    inward: int
     held: Tensor
     at: At
-
-    @property
-    def share(self) -> Tensor:
-        """(M,) of the surface's area."""
-        return self.some.share[self.of]
+    share: Tensor
 
     def ends(self, metric: Tensor) -> tuple[Tensor, Tensor]:
         """Metrics (M, 2, 2) of the maps' beginnings and ends, where A_i is ``metric`` (F, 2, 2)."""
-        own, held, outward = metric[self.of], self.held.to(metric), self.outward[:, None, None]
-        return torch.where(outward, own, held), torch.where(outward, held, own)
+        # not by metric[of], whose backward pass takes long
+        own, held, n = metric.index_select(0, self.of), self.held.to(metric), self.inward
+        return torch.cat([held[:n], own[n:]]), torch.cat([own[:n], held[n:]])
 
 
 class CollectionQuadrature(nn.Module):
@@ -130,7 +129,7 @@ class CollectionQuadrature(nn.Module):
         centres = torch.cat([part.centres for part in parts])
         on_surfaces = torch.cat([part.positions for part in parts])
         at = At(centres[of], on_surfaces[of])
-        return Turn(number, some, of, owner[of] == number, torch.cat(held), at)
+        return Turn(number, some, of, len(inward), torch.cat(held), at, some.share[of])
 
     @torch.no_grad()
     def taken_back(self, number: int, h: Any) -> Tensor:
