@@ -232,15 +232,17 @@ def _collapses(
             boundary[v] = boundary[v] or on_boundary[q]
         around += boundary[v]
     into, before = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-    priority = np.empty(n)
+    priority, mark = np.empty(n), np.empty(n, dtype=np.int64)
     for v in range(n):
-        into[v] = before[v] = -1
+        into[v] = before[v] = mark[v] = -1
         priority[v] = np.inf
+    for v in range(n):
         if held[v] or (boundary[v] and around <= _FEWEST_ON_BOUNDARY):
             continue
         beside = 0  # neighbours on the boundary
         for q in range(start[v], start[v + 1]):
             beside += boundary[indices[q]]
+            mark[indices[q]] = v
         for q in range(start[v], start[v + 1]):
             w = indices[q]
             # inner vertices move onto the boundary only if that makes no chord; boundary ones stay
@@ -256,8 +258,13 @@ def _collapses(
                 cost = np.sqrt(square) * factor[q]
                 if cost < priority[v]:
                     priority[v], into[v] = cost, w
-        if into[v] >= 0 and not _may_collapse(start, indices, v, into[v], 1 if boundary[v] else 2):
-            priority[v], into[v] = np.inf, -1
+        if into[v] >= 0:
+            w, common = into[v], 0
+            for q in range(start[w], start[w + 1]):
+                common += mark[indices[q]] == v
+            crowd = start[v + 1] - start[v] + start[w + 1] - start[w] - 4
+            if common != 2 - boundary[v] or crowd > _MOST_NEIGHBOURS:
+                priority[v], into[v] = np.inf, -1
         if boundary[v]:
             for q in range(start[v], start[v + 1]):
                 if on_boundary[q] and indices[q] != into[v]:
@@ -267,20 +274,6 @@ def _collapses(
         if bad[v]:
             priority[v] = np.inf
     return _apart(start, indices, priority, 2), into, before
-
-
-@compiled
-def _may_collapse(start: np.ndarray, indices: np.ndarray, v: int, w: int, common: int) -> bool:
-    """Whether a vertex and a neighbour have so many neighbours in common, and together not too
-    many."""
-    if start[v + 1] - start[v] + start[w + 1] - start[w] - 4 > _MOST_NEIGHBOURS:
-        return False
-    found, p = 0, start[w]
-    for q in range(start[v], start[v + 1]):
-        while p < start[w + 1] and indices[p] < indices[q]:
-            p += 1
-        found += p < start[w + 1] and indices[p] == indices[q]
-    return found == common
 
 
 @compiled
@@ -294,7 +287,7 @@ def _leave_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray
         for k in range(3):
             v, b, c = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
             w = into[v]
-            if w < 0 or w == b or w == c or result[v]:
+            if w < 0 or w in (b, c) or result[v]:
                 continue
             if not known:
                 _measure(points, faces[f, 0], faces[f, 1], faces[f, 2], old)
