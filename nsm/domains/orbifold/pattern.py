@@ -9,10 +9,9 @@ vertex which is eliminated next.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csc_matrix
 
 from nsm.compiled import compiled
-from nsm.domains.orbifold.tutte import factorised
+from nsm.domains.orbifold.elimination import elimination_order
 from nsm.surfaces import topology
 
 
@@ -39,10 +38,11 @@ class Pattern:
 
     def __init__(self, faces: np.ndarray, count: int) -> None:
         ids, local = topology.renumbered(faces, count)
-        number, *self._fronts = _fronts(local[faces], _elimination(local[faces], len(ids)))
+        faces, n = local[faces], len(ids)
+        number, *self._fronts = _fronts(faces, elimination_order(faces, n))
         self.ids = np.empty_like(ids)
         self.ids[number] = ids
-        self.corner = number[local[faces]]
+        self.corner = number[faces]
         self.place, self.width = _places(self.corner, *self._fronts[:4])
         self.size = int(self._fronts[3][-1])
 
@@ -62,16 +62,6 @@ class Pattern:
         """
         found = right.copy()
         return found if _solve(panels, found, held[self.ids], *self._fronts) else None
-
-
-def _elimination(faces: np.ndarray, n: int) -> np.ndarray:
-    """Vertices (N,) in an order in which elimination fills in little."""
-    i, j, every = faces.ravel(), faces[:, [1, 2, 0]].ravel(), np.arange(n)
-    values = np.repeat([-1.0, float(faces.size)], [2 * len(i), n])
-    ends = (np.concatenate([i, j, every]), np.concatenate([j, i, every]))
-    order = np.empty(n, dtype=np.int64)
-    order[factorised(csc_matrix((values, ends), shape=(n, n))).perm_c] = every
-    return order
 
 
 @compiled
