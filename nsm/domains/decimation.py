@@ -73,7 +73,8 @@ def coarsen(
         # random costs: a collapse that fails in one round is tried differently in the next
         factor = rng.uniform(1.0, 1.7, len(rings.indices))
         arrays = rings.start, rings.indices, rings.on_boundary
-        chosen, into, before = _collapses(vertices[ids], left, held[ids], *arrays, factor)
+        priority, into, before = _collapses(vertices[ids], left, held[ids], *arrays, factor)
+        chosen = rings.apart(priority, 2)
         vertex = np.flatnonzero(chosen)
         if len(vertex) < _LEAST_SHARE * len(ids):
             break
@@ -219,11 +220,14 @@ def _collapses(
     on_boundary: np.ndarray,
     factor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices of those at points (V, 3) to collapse, a mask (V,); what each would be collapsed
-    onto, (V,); and its other boundary neighbour, or -1, (V,).
+    """What each vertex, at points (V, 3), may be collapsed onto.
 
     Args:
         factor: (E,) on the lengths of the edges to neighbours; the shortest of a vertex is taken.
+
+    Returns:
+        the costs (V,), infinite where nothing is good; the neighbours (V,) that it would be
+        collapsed onto; and of boundary vertices the other boundary neighbour (V,), -1 for none.
     """
     n = len(points)
     boundary, around = np.zeros(n, dtype=np.bool_), 0
@@ -273,7 +277,7 @@ def _collapses(
     for v in range(n):
         if bad[v]:
             priority[v] = np.inf
-    return _apart(start, indices, priority, 2), into, before
+    return priority, into, before
 
 
 @compiled

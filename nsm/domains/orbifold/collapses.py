@@ -24,10 +24,10 @@ def collapsed(
         the faces, those that are gone with two equal corners, and the rounds.
     """
     faces = faces.copy()
-    vertex, target, number, start, corners = _collapsed(vertices, faces, held, count)
+    done, vertex, target, number, start, corners = _collapsed(vertices, faces, held, count)
     rounds = []
-    for k in range(int(number.max(initial=-1)) + 1):
-        steps = np.flatnonzero(number == k)
+    for k in range(int(number[:done].max(initial=-1)) + 1):
+        steps = np.flatnonzero(number[:done] == k)
         sizes = start[steps + 1] - start[steps]
         mine = np.concatenate([corners[start[step] : start[step + 1]] for step in steps])
         star = np.repeat(np.arange(len(steps)), sizes)
@@ -38,11 +38,11 @@ def collapsed(
 @compiled
 def _collapsed(
     points: np.ndarray, faces: np.ndarray, held: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Collapse edges within the faces (F, 3).
 
     Returns:
-        of each collapse (N,) the vertex, what it is drawn into, and its round: the first after all
+        how many collapses N, and in the first places of arrays, of each (N,) the vertex, what it is drawn into, and its round: the first after all
         that touched its ring; where its corners 3f + k begin, (N + 1,), and these.
     """
     n, corner = len(points), faces.reshape(-1)
@@ -51,11 +51,10 @@ def _collapsed(
     for v in range(n):
         best[v], into[v], mark[v] = np.inf, -1, -1
     last = np.zeros(n, dtype=np.int64)  # how many rounds touched a vertex or its ring
-    looks = 0
     for v in range(n):
         if degree[v] > 0 and not held[v]:
-            _look(points, corner, twin, out, degree, mark, looks, v, best, into)
-            looks += 1
+            _look(points, corner, twin, out, degree, mark, v, v, best, into)
+    looks = n
     vertex, target = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     number, start = np.empty(n, dtype=np.int64), np.zeros(n + 1, dtype=np.int64)
     replaced, near = np.empty(6 * n, dtype=np.int64), np.empty(n, dtype=np.int64)
@@ -71,7 +70,8 @@ def _collapsed(
         first, end = start[done], start[done] + degree[v]
         if end > len(replaced):
             longer = np.empty(2 * end, dtype=np.int64)
-            longer[:first] = replaced[:first]
+            for i in range(first):
+                longer[i] = replaced[i]
             replaced = longer
         h = edge = out[v]
         found, round_, looks = 0, last[v], looks + 1
@@ -118,7 +118,7 @@ def _collapsed(
             if not held[near[i]]:
                 looks += 1
                 _look(points, corner, twin, out, degree, mark, looks, near[i], best, into)
-    return vertex[:done], target[:done], number[:done], start[: done + 1], replaced
+    return done, vertex, target, number, start, replaced
 
 
 @compiled

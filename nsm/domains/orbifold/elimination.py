@@ -19,14 +19,14 @@ def elimination_order(faces: np.ndarray, n: int) -> np.ndarray:
     # beside a vertex are first its elements, so many, then neighbours that are in none of these
     elements = np.zeros(n, dtype=np.int64)
     # how many vertices one stands for; 0 if it is eliminated, or another one stands for it
-    count, behind, tail = np.ones(n, dtype=np.int64), _none(n), np.arange(n)
+    count, behind, tail = np.ones(n, dtype=np.int64), _none(n), _none(n)
     # where the members of an element are, how many vertices these stand for, and for how many those
     # that are not in the latest element
     first, last = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     whole, outside = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     members, used = np.empty(16 * n, dtype=np.int64), 0
     # lists of the vertices of each degree, and of those of each sum of the numbers beside them
-    degree, head, before, after = end - start[:n], _none(n), _none(n), _none(n)
+    degree, head, before, after = np.empty(n, dtype=np.int64), _none(n), _none(n), _none(n)
     code, bucket, following = np.zeros(n, dtype=np.int64), _none(n), _none(n)
     mark, seen, found = (
         np.zeros(n, dtype=np.int64),
@@ -35,6 +35,7 @@ def elimination_order(faces: np.ndarray, n: int) -> np.ndarray:
     )
     order, kept = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     for v in range(n - 1, -1, -1):
+        tail[v], degree[v] = v, end[v] - start[v]
         _insert(head, before, after, v, degree[v])
     done = step = comparison = least = 0
     while done < n:
@@ -50,7 +51,8 @@ def elimination_order(faces: np.ndarray, n: int) -> np.ndarray:
             w = behind[w]
         if used + n > len(members):
             longer = np.empty(2 * len(members) + n, dtype=np.int64)
-            longer[:used] = members[:used]
+            for p in range(used):
+                longer[p] = members[p]
             members = longer
         # the new element: neighbours, and members of the elements, which go up in it
         count[v], first[v] = 0, used
@@ -147,7 +149,9 @@ def _neighbours(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.n
             start[faces[f, k] + 1] += 2
     for v in range(n):
         start[v + 1] += start[v]
-    end, beside = start[:n].copy(), np.empty(start[n], dtype=np.int64)
+    end, beside = np.empty(n, dtype=np.int64), np.empty(start[n], dtype=np.int64)
+    for v in range(n):
+        end[v] = start[v]
     for f in range(len(faces)):
         for k in range(3):
             v = faces[f, k]
