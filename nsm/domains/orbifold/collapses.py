@@ -42,8 +42,9 @@ def _collapsed(
     """Collapse edges within the faces (F, 3).
 
     Returns:
-        how many collapses N, and in the first places of arrays, of each (N,) the vertex, what it is drawn into, and its round: the first after all
-        that touched its ring; where its corners 3f + k begin, (N + 1,), and these.
+        how many collapses N; and in the first places of arrays, of each (N,) the vertex, what it is
+        drawn into, and its round, the first after all that touched its ring; where its corners
+        3f + k begin, (N + 1,), and these.
     """
     n, corner = len(points), faces.reshape(-1)
     twin, out, degree = _half_edges(corner, n)

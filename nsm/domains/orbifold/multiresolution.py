@@ -18,6 +18,7 @@ from nsm.domains.decimation import Round, coarsen, undo
 from nsm.domains.kernels import innermost
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
+from nsm.domains.orbifold.gauges import regauged
 from nsm.domains.orbifold.newton import Quotient
 from nsm.domains.orbifold.stars import Stars, seen
 from nsm.domains.orbifold.sweeps import put_back, relax
@@ -188,7 +189,7 @@ def laid_out(
     alive = _alive(levels.first.faces)
     local = np.full(len(vertices), -1)
     local[ids] = np.arange(len(ids))
-    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
+    lift = regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
 
     small = Layout(lift[alive], np.zeros((len(ids), 2)), np.eye(2))
     of_cones = None if cones is None else local[cones]
@@ -301,33 +302,6 @@ def _clusters(count: int, rounds: list[Round]) -> np.ndarray:
     for step in reversed(rounds):
         into[step.vertex] = into[step.target]
     return into
-
-
-def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.ndarray:
-    """Lifts (F, 3, 3) with canonical coordinates such that a vertex and the one that it is drawn
-    into have the same lift in the triangles they share: lifts then stay as corners change names."""
-    gauge = group.identities(int(faces.max()) + 1)
-    current, into = faces.copy(), np.arange(len(gauge))
-    for step in rounds:
-        face, k = step.corners // 3, step.corners % 3
-        here = current[face] == step.target[step.star][:, None]
-        shared = np.flatnonzero(here.any(axis=1))
-        which = np.unique(step.star[shared], return_index=True)[1]
-        row = shared[which]
-        f, kv, kw = face[row], k[row], here[row].argmax(axis=1)
-
-        def now(f: np.ndarray, k: np.ndarray) -> np.ndarray:
-            return group.compose(lift[f, k], group.inverse(gauge[faces[f, k]]))
-
-        change = group.compose(group.inverse(now(f, kw)), now(f, kv))
-        number = np.full(len(gauge), -1)
-        number[step.vertex] = np.arange(len(step.vertex))
-        members = np.flatnonzero(number[into] >= 0)
-        mine = number[into[members]]
-        gauge[members] = group.compose(change[mine], gauge[members])
-        into[members] = step.target[mine]
-        current.ravel()[step.corners] = step.target[step.star]
-    return group.compose(lift, group.inverse(gauge[faces]))
 
 
 def _put_back(level: Level, lifts: np.ndarray, layout: Layout, held: np.ndarray) -> bool:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.compiled import compiled
-from nsm.domains.orbifold import group
 
 
 def hats(
@@ -71,9 +70,48 @@ def seen(lift: np.ndarray) -> np.ndarray:
         (3F, 2, 3): sign and shift (s, m, n) of the corner after corner 3f + k, and of the one after
         that.
     """
-    back = group.inverse(lift)
-    both = [group.compose(back, lift[:, turn]) for turn in ([1, 2, 0], [2, 0, 1])]
-    return np.stack(both, axis=2).reshape(-1, 2, 3).astype(np.float64)
+    others = lift[:, [[1, 2], [2, 0], [0, 1]]].astype(np.float64)
+    others[..., 1:] -= lift[:, :, None, 1:]
+    others *= lift[:, :, None, :1]
+    return others.reshape(-1, 2, 3)
+
+
+@compiled
+def _stars(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    scale: float,
+    vertex: np.ndarray,
+    corners: np.ndarray,
+    star: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Start, corners, ring and shape, see :class:`Stars`."""
+    count = len(corners)
+    start, place = np.zeros(len(vertex) + 1, dtype=np.int64), np.empty(len(vertex), dtype=np.int64)
+    for i in range(count):
+        start[star[i] + 1] += 1
+    for s in range(len(vertex)):
+        place[s] = start[s]
+        start[s + 1] += start[s]
+    ordered, triangles = np.empty(count, dtype=np.int64), np.empty((count, 3), dtype=np.int64)
+    ring, shape = np.empty((count, 2), dtype=np.int64), np.empty((count, 4))
+    for i in range(count):
+        at, f, k = place[star[i]], corners[i] // 3, corners[i] % 3
+        place[star[i]] += 1
+        ordered[at] = corners[i]
+        ring[at, 0], ring[at, 1] = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+        triangles[at, 0], triangles[at, 1], triangles[at, 2] = (
+            vertex[star[i]],
+            ring[at, 0],
+            ring[at, 1],
+        )
+    of_triangle, area = _hats(vertices, triangles, 1e-3)
+    for i in range(count):
+        x, z = of_triangle[i, 0], of_triangle[i, 2]
+        w = of_triangle[i, 1] + z
+        shape[i, 0], shape[i, 1] = (x * x + w * w) * area[i], -w * z * area[i]
+        shape[i, 2], shape[i, 3] = z * z * area[i], 0.5 / (scale * area[i])
+    return start, ordered, ring, shape
 
 
 @dataclass(frozen=True)
@@ -115,20 +153,7 @@ class Stars:
             corners: (M,) places 3f + k of them in the faces.
             star: (M,) which of the N each belongs to.
         """
-        order = np.argsort(star, kind="stable")
-        corners, star = corners[order], star[order]
-        start = np.searchsorted(star, np.arange(len(vertex) + 1))
-        face, k = corners // 3, corners % 3
-        triangles = np.stack(
-            [vertex[star], faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]], axis=1
-        )
-        of_triangle, area = hats(vertices, triangles)
-        x, y, z = of_triangle.T
-        w = y + z
-        shape = np.stack(
-            [(x * x + w * w) * area, -w * z * area, z * z * area, 0.5 / (scale * area)], axis=1
-        )
-        return cls(vertex, start, corners, np.ascontiguousarray(triangles[:, 1:]), shape)
+        return cls(vertex, *_stars(vertices, faces, scale, vertex, corners, star))
 
     def ring_places(
         self, number: int, uv: np.ndarray, lattice: np.ndarray, seen: np.ndarray
