@@ -1,21 +1,185 @@
-"""An order of a mesh's vertices in which elimination fills in little: approximate minimum degree.
+"""In which order, and in which dense parts, the unknowns of a mesh's vertices are eliminated.
 
-Amestoy, Davis and Duff 1996, "An approximate minimum degree ordering algorithm". A vertex that is
-eliminated becomes an element: a list of what were its neighbours then, which are neighbours of each
-other from then on. Vertices that come to have the same neighbours are eliminated together.
+Little is filled in where vertices with few neighbours go first (Amestoy, Davis and Duff 1996, "An
+approximate minimum degree ordering algorithm"). Gaussian elimination is done by fronts (Duff and
+Reid 1983, "The multifrontal solution of indefinite sparse symmetric linear equations"): what is
+left of a front, when its vertices are gone, is added to that of the first vertex that follows.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from nsm.compiled import compiled
 
 
-@compiled
-def elimination_order(faces: np.ndarray, n: int) -> np.ndarray:
-    """Vertices (N,) of faces (F, 3) as they are to be eliminated."""
+class Fronts(NamedTuple):
+    """Sets of vertices that are eliminated one after the other, each with the same neighbours left.
+
+    Attributes:
+        number: (N,) of the vertices, as they are eliminated.
+        begin: (S + 1,) the first number that each of the fronts eliminates.
+        first: (S + 1,) where its vertices begin.
+        row: (R,) these, by their numbers, which rise: those that it eliminates and the neighbours
+            that are left.
+        into: (S,) the front that what is left of it is added to; -1 for none.
+        relative: (R,) where vertices that are left are in that front.
+        panel: (S + 1,) where its panel begins, a row for each coordinate of vertices that it
+            eliminates, with a column for each of all its vertices.
+        kept: (S,) where what is left of it is kept.
+        room: first of (2,), what all that is left takes.
+    """
+
+    number: np.ndarray
+    begin: np.ndarray
+    first: np.ndarray
+    row: np.ndarray
+    into: np.ndarray
+    relative: np.ndarray
+    panel: np.ndarray
+    kept: np.ndarray
+    room: np.ndarray
+
+
+def fronts(faces: np.ndarray, n: int) -> Fronts:
+    """Those of the vertices (N,) of faces (F, 3), in an order in which little is filled in."""
     start, end, beside = _neighbours(faces, n)
+    order = _elimination_order(start, end.copy(), beside.copy())
+    return Fronts(*_fronts(start, end, beside, order))
+
+
+@compiled
+def _fronts(
+    start: np.ndarray, end: np.ndarray, beside: np.ndarray, order: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """The fronts for vertices with neighbours that are eliminated in about the given order."""
+    n = len(order)
+    order, number, parent = _tree(start, end, beside, order)
+    # the vertices that a column of the factorised matrix has rows of: the paths in the tree from
+    # the neighbours of each (Gilbert, Ng and Peyton 1994)
+    count, mark = np.zeros(n, dtype=np.int64), _none(2 * n)
+    for i in range(n):
+        for q in range(start[order[i]], end[order[i]]):
+            k = number[beside[q]]
+            while k < i and mark[k] != i:
+                mark[k] = i
+                count[k] += 1
+                k = parent[k]
+    of, begin, first = _none(n), np.zeros(n + 1, dtype=np.int64), np.zeros(n + 1, dtype=np.int64)
+    fronts = 0
+    for j in range(n):
+        of[j] = fronts
+        if j + 1 == n or parent[j] != j + 1 or count[j] != count[j + 1] + 1:
+            begin[fronts + 1] = j + 1
+            first[fronts + 1] = first[fronts] + j + 1 - begin[fronts] + count[j]
+            fronts += 1
+    row, place = np.empty(first[fronts], dtype=np.int64), first.copy()
+    for i in range(n):
+        row[place[of[i]]] = i
+        place[of[i]] += 1
+        for q in range(start[order[i]], end[order[i]]):
+            k = number[beside[q]]
+            while k < i and mark[n + k] != i:
+                mark[n + k] = i
+                if k + 1 == begin[of[k] + 1] and of[i] != of[k]:
+                    row[place[of[k]]] = i
+                    place[of[k]] += 1
+                k = parent[k]
+    panel, into = np.zeros(fronts + 1, dtype=np.int64), _none(fronts)
+    # what is left is kept on two stacks, in turn from front to front up the tree: then a front is
+    # made on the one while those that are added to it are taken from the other
+    side, below = np.zeros(fronts, dtype=np.int64), _none(fronts)
+    for s in range(fronts - 1, -1, -1):
+        rest = first[s] + begin[s + 1] - begin[s]
+        if rest < first[s + 1]:
+            into[s] = of[row[rest]]
+            side[s] = 1 - side[into[s]]
+    top, most = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    kept, relative = np.empty(fronts, dtype=np.int64), np.empty(first[fronts], dtype=np.int64)
+    for s in range(fronts):
+        own, whole = begin[s + 1] - begin[s], first[s + 1] - first[s]
+        panel[s + 1] = panel[s] + 4 * own * whole
+        if below[s] >= 0:
+            top[1 - side[s]] = below[s]
+        kept[s] = top[side[s]]
+        top[side[s]] += 4 * (whole - own) ** 2
+        most[side[s]] = max(most[side[s]], top[side[s]])
+        if into[s] >= 0:
+            if below[into[s]] < 0:
+                below[into[s]] = kept[s]
+            q = first[into[s]]
+            for i in range(first[s] + own, first[s + 1]):
+                while row[q] != row[i]:
+                    q += 1
+                relative[i] = q - first[into[s]]
+    for s in range(fronts):
+        kept[s] += side[s] * most[0]
+    most[0] += most[1]
+    return number, begin[: fronts + 1], first[: fronts + 1], row, into, relative, panel, kept, most
+
+
+@compiled
+def _tree(
+    start: np.ndarray, end: np.ndarray, beside: np.ndarray, order: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The elimination tree (Liu 1990, "The role of elimination trees in sparse factorization") for
+    vertices in an order: the order (N,) renewed so that those before a vertex that it depends on
+    come right before it, the numbers of the vertices in it, and the parent of each number."""
+    n = len(order)
+    number = np.empty(n, dtype=np.int64)
+    for j in range(n):
+        number[order[j]] = j
+    above, short = _none(n), _none(n)  # short cuts towards the root
+    for j in range(n):
+        for q in range(start[order[j]], end[order[j]]):
+            i = number[beside[q]]
+            while i != -1 and i < j:
+                following = short[i]
+                short[i] = j
+                if following == -1:
+                    above[i] = j
+                i = following
+    child, sibling = _none(n), _none(n)
+    for j in range(n - 1, -1, -1):
+        if above[j] >= 0:
+            sibling[j], child[above[j]] = child[above[j]], j
+    renewed, stack = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    done = 0
+    for root in range(n):
+        if above[root] >= 0:
+            continue
+        stack[0], depth = root, 1
+        while depth > 0:
+            j = stack[depth - 1]
+            if child[j] >= 0:
+                stack[depth] = child[j]
+                child[j] = sibling[child[j]]
+                depth += 1
+            else:
+                renewed[j] = done
+                done += 1
+                depth -= 1
+    parent, new = _none(n), np.empty(n, dtype=np.int64)
+    for j in range(n):
+        new[renewed[j]] = order[j]
+        if above[j] >= 0:
+            parent[renewed[j]] = renewed[above[j]]
+    for j in range(n):
+        number[new[j]] = j
+    return new, number, parent
+
+
+@compiled
+def _elimination_order(start: np.ndarray, end: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Vertices (N,) with neighbours as they are to be eliminated; end and neighbours are used up.
+
+    Approximate minimum degree. A vertex that is eliminated becomes an element: a list of what were
+    its neighbours then, which are neighbours of each other from then on. Vertices that come to have
+    the same neighbours are eliminated together.
+    """
+    n = len(end)
     # beside a vertex are first its elements, so many, then neighbours that are in none of these
     elements = np.zeros(n, dtype=np.int64)
     # how many vertices one stands for; 0 if it is eliminated, or another one stands for it
