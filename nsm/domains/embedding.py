@@ -208,8 +208,8 @@ def _slim_held(
 
 
 def _sliding_steps(n_faces: int) -> int:
-    """Number of sliding steps, such that they take seconds."""
-    return int(np.clip(800_000 / n_faces, 6, 60))
+    """Number of sliding steps, such that they take about a second."""
+    return int(np.clip(2_000_000 / n_faces, 15, 150))
 
 
 def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:

@@ -70,7 +70,8 @@ class Quotient:
         """
         start, pattern = self.energy(j), self.mesh.pattern
         slope, panels = self.derivatives(j)
-        solution = pattern.solution(panels, slope, self.held)
+        held = np.repeat(self.held[pattern.ids, None], 2, axis=1)
+        solution = pattern.solution(panels, slope, held)
         if solution is None:  # singular: no step
             return uv, j, start, 0.0
         along = -float((slope * solution).sum())

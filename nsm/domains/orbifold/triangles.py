@@ -10,8 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from nsm.domains.orbifold.pattern import Pattern
 from nsm.domains.orbifold.stars import Stars, hats
+from nsm.domains.sparse_systems import Pattern
 from nsm.domains.vertex_relaxation import colours
 from nsm.surfaces import topology
 

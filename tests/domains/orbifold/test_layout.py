@@ -17,11 +17,11 @@ from nsm.domains.orbifold.cones import compared
 from nsm.domains.orbifold.lifts import cone_lifts
 from nsm.domains.orbifold.multiresolution import Effort, laid_out, scaled
 from nsm.domains.orbifold.newton import Quotient, distortions
-from nsm.domains.orbifold.pattern import Pattern
 from nsm.domains.orbifold.stars import seen
 from nsm.domains.orbifold.sweeps import relax
 from nsm.domains.orbifold.triangles import Triangles
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
+from nsm.domains.sparse_systems import Pattern
 from nsm.surfaces import topology
 
 
@@ -142,7 +142,7 @@ def test_sparse_systems_are_solved(held: tuple[int, ...], count: int) -> None:
     rows = np.repeat(stays[pattern.ids], 2)
     expected[rows, rows] = 1.0
     right = rng.normal(size=(count, 2))
-    found = pattern.solution(panels, right, stays)
+    found = pattern.solution(panels, right, rows.reshape(-1, 2))
     assert found is not None
     np.testing.assert_allclose(
         found.ravel(), np.linalg.solve(expected, right.ravel()), rtol=1e-6, atol=1e-6
@@ -152,7 +152,7 @@ def test_sparse_systems_are_solved(held: tuple[int, ...], count: int) -> None:
 def test_a_singular_system_has_no_solution() -> None:
     _, faces = hull(3, 25)
     pattern = Pattern(faces, 25)
-    right, nothing = np.ones((25, 2)), np.zeros(25, dtype=bool)
+    right, nothing = np.ones((25, 2)), np.zeros((25, 2), dtype=bool)
     assert pattern.solution(np.zeros(pattern.size), right, nothing) is None
 
 

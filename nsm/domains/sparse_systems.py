@@ -1,11 +1,14 @@
-"""Sparse matrices of second derivatives by the coordinates of a mesh's vertices."""
+"""Sparse systems of second derivatives by the coordinates of a mesh's vertices, and their solution.
+
+No row is exchanged for another: that suffices for positive definite matrices.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from nsm.compiled import compiled
-from nsm.domains.orbifold.elimination import fronts
+from nsm.domains.elimination import fronts
 from nsm.surfaces import topology
 
 
@@ -13,10 +16,10 @@ class Pattern:
     """Where second derivatives by the coordinates of corners go in a sparse matrix.
 
     The matrix is symmetric, with two rows and columns for each vertex. It is held in the panels of
-    :class:`nsm.domains.orbifold.elimination.Fronts`.
+    :class:`nsm.domains.elimination.Fronts`.
 
     Args:
-        faces: (F, 3) of a closed mesh.
+        faces: (F, 3).
         count: of the vertices, V.
 
     Attributes:
@@ -42,20 +45,22 @@ class Pattern:
     def solution(
         self, panels: np.ndarray, right: np.ndarray, held: np.ndarray
     ) -> np.ndarray | None:
-        """Solve for right-hand sides (N, 2), with rows and columns of some vertices replaced by
+        """Solve for a right-hand side (N, 2), with rows and columns of some unknowns replaced by
         those of the identity.
 
         Args:
-            panels: (size,) of the matrix; used up. Nothing is added for these vertices.
+            panels: (size,) of the matrix; used up. Nothing is in these rows and columns.
             right: in the order of ids.
-            held: (V,) mask of these vertices.
+            held: (N, 2) mask of these unknowns, in that order.
 
         Returns:
             (N, 2); None if the matrix is singular.
         """
         found = right.copy()
         return (
-            found if _solve(panels, found.reshape(-1), held[self.ids], *self._fronts[1:]) else None
+            found
+            if _solve(panels, found.reshape(-1), held.reshape(-1), *self._fronts[1:])
+            else None
         )
 
 
@@ -114,7 +119,7 @@ def _solve(
         rest, pivot = width - own, pivots[2 * begin[s] : 2 * begin[s + 1]]
         for q in range(own):
             at = panel[s] + q * (width + 1)
-            panels[at] = 1.0 if held[begin[s] + q // 2] else panels[at] * (1 + 1e-10)
+            panels[at] = 1.0 if held[2 * begin[s] + q] else panels[at] * (1 + 1e-10)
         for at in range(kept[s], kept[s] + rest * rest):
             left[at] = 0.0
         c = child[s]
