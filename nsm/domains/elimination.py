@@ -313,19 +313,21 @@ def _neighbours(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.n
             start[faces[f, k] + 1] += 2
     for v in range(n):
         start[v + 1] += start[v]
-    end, beside = np.empty(n, dtype=np.int64), np.empty(start[n], dtype=np.int64)
+    end, beside, mark = np.empty(n, dtype=np.int64), np.empty(start[n], dtype=np.int64), _none(n)
     for v in range(n):
         end[v] = start[v]
     for f in range(len(faces)):
         for k in range(3):
             v = faces[f, k]
-            for turn in (1, 2):
-                w, known = faces[f, (k + turn) % 3], False
-                for q in range(start[v], end[v]):
-                    known = known or beside[q] == w
-                if not known:
-                    beside[end[v]] = w
-                    end[v] += 1
+            beside[end[v]], beside[end[v] + 1] = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            end[v] += 2
+    for v in range(n):
+        end[v] = start[v]
+        for q in range(start[v], start[v + 1]):
+            w = beside[q]
+            if mark[w] != v:
+                mark[w], beside[end[v]] = v, w
+                end[v] += 1
     return start, end, beside
 
 

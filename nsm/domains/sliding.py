@@ -38,7 +38,7 @@ def slide(
     problem = _Problem.of(vertices, faces, loop, held, domain)
     energy, gain = problem.energy(uv), np.inf
     for k in range(steps):
-        at("sliding along the boundary", k, steps)
+        at("SLIM", k, steps)
         direction = problem.proxy_step(uv)
         if direction is None:
             break

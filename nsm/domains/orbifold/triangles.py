@@ -41,7 +41,7 @@ class Triangles:
 
     @cached_property
     def stars(self) -> Stars:
-        """Those of all vertices."""
+        """Those of all vertices: a set without neighbours, then another one, and so on."""
         ids, local = topology.renumbered(self.faces, len(self.vertices))
         owner = local[self.faces.ravel()]
         colour = colours(owner.reshape(-1, 3), len(ids))
