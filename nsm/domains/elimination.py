@@ -198,11 +198,17 @@ def _elimination_order(start: np.ndarray, end: np.ndarray, beside: np.ndarray) -
         np.zeros(n, dtype=np.int64),
     )
     order, kept = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    left = n
     for v in range(n - 1, -1, -1):
         tail[v], degree[v] = v, end[v] - start[v]
-        _insert(head, before, after, v, degree[v])
+        if degree[v] > 16 + 10 * np.sqrt(n):  # the last: to count its neighbours takes long
+            count[v] = 0
+            left -= 1
+            order[left] = v
+        else:
+            _insert(head, before, after, v, degree[v])
     done = step = comparison = least = 0
-    while done < n:
+    while done < left:
         step += 1
         while head[least] < 0:
             least += 1

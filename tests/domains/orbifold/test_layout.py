@@ -118,12 +118,20 @@ def test_second_derivatives_are_exact_where_they_are_positive() -> None:
             np.testing.assert_allclose(hessian[2 * v + i], expected, rtol=1e-4, atol=1e-4 * scale)
 
 
+def _fan(count: int) -> np.ndarray:
+    """Triangles around one vertex that is beside all others."""
+    ring = np.arange(1, count)
+    return np.stack([np.zeros_like(ring), ring, np.roll(ring, -1)], axis=1)
+
+
 @pytest.mark.parametrize("held", [(), (0, 6, 12, 18)])
-@pytest.mark.parametrize("count", [4, 25, 300])
-def test_sparse_systems_are_solved(held: tuple[int, ...], count: int) -> None:
+@pytest.mark.parametrize("faces", [*(hull(3, n)[1] for n in (4, 25, 300)), _fan(500)])
+def test_sparse_systems_are_solved(held: tuple[int, ...], faces: np.ndarray) -> None:
     """Whatever the fronts: with some vertices held, their unknowns are the right-hand side's."""
-    _, faces = hull(3, count)
+    count = int(faces.max()) + 1
     pattern = Pattern(faces, count)
+    assert sorted(pattern.ids.tolist()) == list(range(count))
+    assert count < 300 or pattern.size < 0.1 * (2 * count) ** 2 / 2  # little is filled in
     stays = np.zeros(count, dtype=bool)
     stays[[v for v in held if v < count]] = True
     rng, panels = np.random.default_rng(0), np.zeros(pattern.size)
