@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csc_matrix, csr_matrix, diags
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import csc_matrix, diags
 
+from nsm.domains.positive_definite import factorise
 from nsm.surfaces import topology
 
 
@@ -36,7 +36,7 @@ def tutte(
     uv[loop] = boundary
     if len(inner):
         right = -laplacian[inner][:, loop] @ boundary
-        uv[inner] = factorise(laplacian[inner][:, inner]).solve(right)
+        uv[inner] = factorise(laplacian[inner][:, inner].tocsc()).solve(right)
     return uv
 
 
@@ -55,13 +55,3 @@ def _mean_values(
         columns += [j, m]
         values += [half / la, half / lb]
     return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
-
-
-def factorise(matrix: csr_matrix) -> SuperLU:
-    """LU of a positive definite matrix, with diagonal pivots, as others would cause large fill."""
-    return splu(
-        matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix, diags, kron
-from scipy.sparse.linalg import splu
 
+from nsm.domains.positive_definite import factorise
 from nsm.maps import LatticeSplineGrid
 from nsm.maps.two_scale import two_scale_weights
 
@@ -67,13 +67,7 @@ class _Cycle:
         self.coarser: _Cycle | None = None
         self.factors: Any = None
         if not ups:
-            # symmetric and positive: no pivoting, and an ordering that knows it
-            self.factors = splu(
-                matrix.tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
+            self.factors = factorise(matrix.tocsc())
             return
         self.up = ups[0]
         self.down = self.up.T.tocsr()

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import SuperLU, splu
 
 from nsm.domains.orbifold import group
+from nsm.domains.positive_definite import factorise
 from nsm.errors import NsmError
 
 WEIGHTS = ("mean_value", "uniform", "cotangent")
@@ -63,22 +63,9 @@ def tutte(
         x[cones] = group.CONES
     free = np.flatnonzero(~held)
     right = force[free] - matrix[free] @ x
-    x[free] = _factorised(matrix[free][:, free].tocsc()).solve(right)
+    x[free] = factorise(matrix[free][:, free].tocsc()).solve(right)
     edge = gi[:, :1] * x[i] - gj[:, :1] * x[j] + gap
     return x, (edge * w[:, None]).T @ edge
-
-
-def _factorised(matrix: csc_matrix) -> SuperLU:
-    """A factorisation of a symmetric positive definite matrix."""
-    # supernodes are not enlarged: on meshes that costs more than it saves
-    return splu(
-        matrix,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        relax=1,
-        panel_size=4,
-        options={"SymmetricMode": True},
-    )
 
 
 def edge_weights(vertices: np.ndarray, faces: np.ndarray, kind: str) -> np.ndarray:
