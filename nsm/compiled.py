@@ -6,6 +6,9 @@ from collections.abc import Callable
 from typing import TypeVar, cast
 
 import numba
+from numba.core import event
+
+from nsm.stages import waits_for
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -30,3 +33,16 @@ def compiled(function: F) -> F:
         return made(kept=True)
     except RuntimeError:  # no folder for the machine code
         return made(kept=False)
+
+
+class _Told(event.Listener):
+    """Tells those who wait that a function is compiled."""
+
+    def on_start(self, event: event.Event) -> None:
+        waits_for("compiling, the first time only")
+
+    def on_end(self, event: event.Event) -> None:
+        waits_for("")
+
+
+event.register("numba:compile", _Told())

@@ -94,6 +94,7 @@ class Stage:
     def __init__(self, title: str = "") -> None:
         self.titles = [title] if title else []
         self.count, self.outer, self.figures = _Count(), list[_Count](), ""
+        self.aside = ""
         self.started = time.monotonic()
         self._ended = threading.Event()
 
@@ -108,9 +109,11 @@ class Stage:
         self.count.early, self.figures = early, figures
 
     def text(self, seconds: bool = True) -> str:
-        """Titles, step, ``seconds`` so far, the time left of steps that are counted, figures."""
+        """Titles, step, ``seconds`` so far, the time left of steps that are counted, figures, and
+        what the step waits for."""
         so_far = f"{time.monotonic() - self.started:.0f} s" if seconds else ""
-        parts = (*self.titles, self.numbered_step(), so_far, self._left(), self.figures)
+        step = self.numbered_step()
+        parts = (*self.titles, step, so_far, self._left(), self.figures, self.aside)
         return "  ".join(part for part in parts if part)
 
     def _left(self) -> str:
@@ -242,6 +245,13 @@ def at(step: str, done: int = 0, total: int = 0, figures: str = "", early: bool 
     shown = _current.get()
     if shown is not None:
         shown.at(step, done, total, figures, early)
+
+
+def waits_for(aside: str) -> None:
+    """Say what the step waits for; nothing, if ``aside`` is empty."""
+    shown = _current.get()
+    if shown is not None:
+        shown.aside = aside
 
 
 def counted(step: str, items: Sequence[T]) -> Iterator[T]:

@@ -1,0 +1,52 @@
+"""Compiled functions: told while they are compiled, kept, and made anew where nothing is kept."""
+
+import numpy as np
+
+from nsm import stages
+from nsm.compiled import compiled
+
+
+def double(x):
+    for k in range(len(x)):
+        x[k] *= 2
+
+
+def test_who_waits_is_told_that_a_function_is_compiled(monkeypatch):
+    said = []
+    monkeypatch.setattr("nsm.compiled.waits_for", said.append)
+    twice, x = compiled(double), np.ones(3)
+    twice.recompile() if twice.signatures else twice(x)
+    assert said[0].startswith("compiling") and said[-1] == ""
+
+
+def test_what_a_step_waits_for_is_in_its_line():
+    shown = stages.Stage("work")
+    token = stages._current.set(shown)
+    try:
+        stages.at("a step")
+        stages.waits_for("a compiler")
+        assert shown.text(seconds=False) == "work  a step  a compiler"
+        stages.waits_for("")
+        assert shown.text(seconds=False) == "work  a step"
+    finally:
+        stages._current.reset(token)
+
+
+def test_functions_are_compiled_where_no_folder_keeps_them(monkeypatch):
+    from numba.core import caching
+
+    def none(*_):
+        return None
+
+    for locator in caching.CacheImpl._locator_classes:
+        monkeypatch.setattr(locator, "from_function", classmethod(none))
+    x = np.ones(3)
+    compiled(double)(x)
+    assert x.tolist() == [2, 2, 2]
+
+
+def test_division_by_zero_is_numpys():
+    def divided(x, y):
+        return x / y
+
+    assert compiled(divided)(1.0, 0.0) == np.inf
