@@ -182,6 +182,7 @@ def laid_out(
         NsmError: a vertex finds no place without a flip, for lack of digits (``not_injective``).
     """
     effort = effort or Effort()
+    vertices, faces, lift = (np.ascontiguousarray(a) for a in (vertices, faces, lift))
     held = np.zeros(len(vertices), dtype=bool)
     held[faces[0, 0] if cones is None else cones] = True
     levels = levels or hierarchy(vertices, faces, held, effort, AREA[cones is not None])
