@@ -53,19 +53,20 @@ class Round:
 def coarsen(
     vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, count: int
 ) -> tuple[np.ndarray, list[Round]]:
-    """Collapse edges of a disc-shaped mesh (V, 3), (F, 3) until about ``count`` faces are left.
+    """Collapse edges of a mesh (V, 3), (F, 3) until about ``count`` faces are left.
 
     Remaining vertices do not move. No inner edge comes to join two boundary vertices.
 
     Args:
+        faces: those that are removed already have two equal corners.
         held: (V,) mask of vertices that are not collapsed.
 
     Returns:
         The faces (F, 3), where removed ones have two equal corners; and the rounds.
     """
-    faces, alive = faces.copy(), np.arange(len(faces))
-    ids, local = topology.renumbered(faces, len(vertices))
-    left = local[faces]  # the faces that are left, by the numbers of their vertices in ids
+    faces, alive = faces.copy(), np.flatnonzero(_has_area(faces))
+    ids, local = topology.renumbered(faces[alive], len(vertices))
+    left = local[faces[alive]]  # the faces that are left, by the numbers of their vertices in ids
     rng = np.random.default_rng(0)
     rounds: list[Round] = []
     while len(alive) > count:

@@ -35,6 +35,7 @@ def slide(
     inside, one along the boundary, none for held vertices), then searches along it for a lower
     symmetric Dirichlet energy without flips. Returns the last, lowest uv.
     """
+    uv, faces = np.ascontiguousarray(uv), np.ascontiguousarray(faces)
     problem = _Problem.of(vertices, faces, loop, held, domain)
     energy, gain = problem.energy(uv), np.inf
     for k in range(steps):

@@ -84,7 +84,7 @@ def untangled(
         closely as possible. The caller counts flips that remain: some do where a bounded number of
         evaluations is spent.
     """
-    image = np.array(image, dtype=np.float64)
+    image = np.array(image, dtype=np.float64, order="C")
     copies = Copies.none(len(image)) if copies is None else copies
     joined = copies.first[faces]  # the triangles with each vertex by one number
     held = np.zeros(len(image), dtype=bool)
@@ -141,6 +141,7 @@ def _solve(
     if not (area > 0).all():
         return 0
     inverse = _cofactors(_sides(shape, faces)).transpose(0, 2, 1) / (2 * area[:, None, None])
+    inverse = np.ascontiguousarray(inverse)
     first = copies.first[vertices]
     moving = np.unique(first[free[first]])
     which = np.where(free[first], np.searchsorted(moving, first), -1)

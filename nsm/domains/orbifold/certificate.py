@@ -76,21 +76,25 @@ def torn_edges(faces: np.ndarray, lift: np.ndarray, cones: np.ndarray | None = N
     next_first, next_second = (3 * face + following).T
     tail = joining(first, next_second)
     head = joining(next_first, second)
-    if cones is None:
-        return int((tail != head).any(axis=1).sum())
+    torn = np.flatnonzero((tail != head).any(axis=1))
+    if cones is None or not len(torn):
+        return len(torn)
+    first, next_first, second, next_second = (
+        i[torn] for i in (first, next_first, second, next_second)
+    )
     number = np.full(int(faces.max()) + 1, -1)
     number[cones] = np.arange(4)
     vertices = faces.ravel()
-    of_tail, of_head = number[vertices[first]], number[vertices[next_first]]
     turn = group.half_turn(group.CONES)
 
-    def through(i: np.ndarray, j: np.ndarray, cone: np.ndarray) -> np.ndarray:
-        return group.compose(group.compose(flat[i], turn[cone]), group.inverse(flat[j]))
+    def ways(i: np.ndarray, j: np.ndarray, joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What joins two lifts of a vertex, and what does through a cone there."""
+        cone = number[vertices[i]]
+        through = group.compose(group.compose(flat[i], turn[cone]), group.inverse(flat[j]))
+        return joined, np.where(cone[:, None] >= 0, through, joined)
 
-    turned_tail = np.where(of_tail[:, None] >= 0, through(first, next_second, of_tail), tail)
-    turned_head = np.where(of_head[:, None] >= 0, through(next_first, second, of_head), head)
-    agree = np.zeros(len(pairs), dtype=bool)
-    for a in (tail, turned_tail):
-        for b in (head, turned_head):
+    agree = np.zeros(len(torn), dtype=bool)
+    for a in ways(first, next_second, tail[torn]):
+        for b in ways(next_first, second, head[torn]):
             agree |= (a == b).all(axis=1)
     return int((~agree).sum())

@@ -8,9 +8,10 @@ from itertools import product
 
 import numpy as np
 
+from nsm.domains.decimation import coarsen, present_faces
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.certificate import Certificate, certificate
-from nsm.domains.orbifold.cones import choose_cones
+from nsm.domains.orbifold.cones import LARGE, choose_cones
 from nsm.domains.orbifold.lifts import check_sphere, cone_lifts, torus_lifts
 from nsm.domains.orbifold.multiresolution import Effort, laid_out
 from nsm.domains.orbifold.newton import distortions
@@ -137,14 +138,20 @@ def embed_orbifold(
     """
     log: list[str] = []
     keep_order = cones is not None if keep_order is None else keep_order
+    begun = None
     if cones is None:
         check_sphere(faces)
-        chosen, table = choose_cones(vertices, faces)
+        few = faces
+        if len(faces) > LARGE:  # the cones are vertices that stay
+            nothing = np.zeros(len(vertices), dtype=bool)
+            begun = coarsen(vertices, faces, nothing, LARGE // 2)
+            few = present_faces(begun[0])
+        chosen, table = choose_cones(vertices, few)
         cones = chosen.tolist()
         log += [f"cones {list(four)}: mean log distortion {value:.3f}" for value, four in table]
     corners = np.asarray(cones, dtype=np.int64)
     lift, _ = cone_lifts(vertices, faces, corners.tolist())
-    layout = laid_out(vertices, faces, lift, corners, effort=effort)
+    layout = laid_out(vertices, faces, lift, corners, effort=effort, begun=begun)
     x = np.linalg.solve(layout.lattice, layout.uv.T).T
     x[corners] = group.CONES
     return _finished(faces, layout.lift, x, layout.lattice, corners, keep_order, log)

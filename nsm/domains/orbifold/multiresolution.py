@@ -145,13 +145,26 @@ class Hierarchy:
 
 
 def hierarchy(
-    vertices: np.ndarray, faces: np.ndarray, held: np.ndarray, effort: Effort, area: float
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    held: np.ndarray,
+    effort: Effort,
+    area: float,
+    begun: tuple[np.ndarray, list[Round]] | None = None,
 ) -> Hierarchy:
-    """Draw a closed mesh (V, 3), (F, 3) together for a domain of an area; the vertices of a mask
-    (V,) stay."""
+    """Draw a closed mesh together.
+
+    Args:
+        vertices, faces: (V, 3), (F, 3).
+        held: (V,) mask of vertices that stay.
+        area: of the domain.
+        begun: the faces (F, 3) after first rounds, in which these vertices stayed, and the rounds.
+    """
     if len(faces) > _SLOW:
         at("drawing the mesh together")
-    current, rounds = coarsen(vertices, faces, held, effort.coarse)
+    start, first = begun or (faces, [])
+    current, rounds = coarsen(vertices, start, held, effort.coarse)
+    rounds = first + rounds
     alive = _alive(current)
     ids, local = topology.renumbered(current[alive], len(vertices))
     few, last_rounds = collapsed(vertices[ids], local[current[alive]], held[ids], effort.coarsest)
@@ -169,6 +182,7 @@ def laid_out(
     weights: str = "uniform",
     effort: Effort | None = None,
     levels: Hierarchy | None = None,
+    begun: tuple[np.ndarray, list[Round]] | None = None,
 ) -> Layout:
     """Lay a closed mesh (V, 3), (F, 3) out with little symmetric Dirichlet energy, no flips.
 
@@ -176,15 +190,18 @@ def laid_out(
         lift: (F, 3, 3); the result's may have other canonical coordinates.
         cones: (4,) vertices; None for a torus.
         weights: of the first embedding, see :func:`tutte.edge_weights`.
-        levels: if the mesh has been drawn together before, with the cones held.
+        levels: if the mesh has been drawn together before, with the cones held; and
+        begun: if that has only begun, see :func:`hierarchy`.
 
     Raises:
         NsmError: a vertex finds no place without a flip, for lack of digits (``not_injective``).
     """
     effort = effort or Effort()
+    vertices, faces, lift = (np.ascontiguousarray(a) for a in (vertices, faces, lift))
     held = np.zeros(len(vertices), dtype=bool)
     held[faces[0, 0] if cones is None else cones] = True
-    levels = levels or hierarchy(vertices, faces, held, effort, AREA[cones is not None])
+    area = AREA[cones is not None]
+    levels = levels or hierarchy(vertices, faces, held, effort, area, begun)
     ids, rounds = levels.ids, levels.first.rounds
     alive = _alive(levels.first.faces)
     local = np.full(len(vertices), -1)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from nsm.domains.orbifold import embedding as embedding_module
 from nsm.domains.orbifold.certificate import torn_edges
 from nsm.domains.orbifold.cones import choose_cones, extremities
 from nsm.domains.orbifold.embedding import (
@@ -77,6 +78,18 @@ def test_the_tips_are_found_and_chosen() -> None:
     embedding = embed_orbifold(vertices, faces)
     assert embedding.cones is not None and set(embedding.cones.tolist()) == set(cones.tolist())
     assert embedding.certificate().injective and embedding.log
+
+
+def test_a_large_mesh_is_drawn_together_once_for_its_cones_and_its_layout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vertices, faces, _ = limbs()
+    at_once = embed_orbifold(vertices, faces)
+    monkeypatch.setattr(embedding_module, "LARGE", len(faces) // 2)
+    found = embed_orbifold(vertices, faces)
+    assert found.certificate().injective
+    means = [np.log(e.distortions(vertices)).mean() for e in (at_once, found)]
+    assert means[1] == pytest.approx(means[0], rel=0.05)
 
 
 def test_all_orders_of_the_cones_without_another_solve(
