@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
+from nsm.compiled import compiled
 from nsm.surfaces import topology
 
 # A new triangle's normal may turn by 70°, and its double area over its squared sides (0.29 if they
@@ -63,29 +63,32 @@ def coarsen(
     Returns:
         The faces (F, 3), where removed ones have two equal corners; and the rounds.
     """
-    faces, flat, places = faces.copy(), np.arange(3), np.ascontiguousarray(vertices.T)
-    alive = np.arange(len(faces))
+    faces, alive = faces.copy(), np.arange(len(faces))
+    ids, local = topology.renumbered(faces, len(vertices))
+    left = local[faces]  # the faces that are left, by the numbers of their vertices in ids
     rng = np.random.default_rng(0)
     rounds: list[Round] = []
     while len(alive) > count:
-        present = faces[alive]
-        ids, local = topology.renumbered(present, len(vertices))
-        vertex, target, before = _collapses(
-            places.take(ids, axis=1), local[present], held[ids], rng
-        )
+        rings = Rings(left, len(ids))
+        # random costs: a collapse that fails in one round is tried differently in the next
+        factor = rng.uniform(1.0, 1.7, len(rings.indices))
+        arrays = rings.start, rings.indices, rings.on_boundary
+        priority, into, before = _collapses(vertices[ids], left, held[ids], *arrays, factor)
+        chosen = rings.apart(priority, 2)
+        vertex = np.flatnonzero(chosen)
         if len(vertex) < _LEAST_SHARE * len(ids):
             break
-        number = np.full(len(vertices), -1)
-        number[ids[vertex]] = np.arange(len(vertex))
-        star = number[present]
-        touched = star >= 0
-        corners = (3 * alive[:, None] + flat)[touched]
-        star = star[touched]
-        faces.ravel()[corners] = ids[target][star]
-        rounds.append(
-            Round(ids[vertex], ids[target], np.where(before < 0, -1, ids[before]), corners, star)
-        )
-        alive = alive[_has_area(faces[alive])]
+        face, k = np.nonzero(chosen[left])
+        corners, moved = 3 * alive[face] + k, left[face, k]
+        left[face, k] = into[moved]
+        faces.ravel()[corners] = ids[into[moved]]
+        other = np.where(before[vertex] < 0, -1, ids[before[vertex]])
+        star = np.searchsorted(vertex, moved)
+        rounds.append(Round(ids[vertex], ids[into[vertex]], other, corners, star))
+        keep = _has_area(left)
+        alive, left = alive[keep], left[keep]
+        used, local = topology.renumbered(left, len(ids))
+        ids, left = ids[used], local[left]
     return faces, rounds
 
 
@@ -117,119 +120,198 @@ def _has_area(faces: np.ndarray) -> np.ndarray:
 
 
 class Rings:
-    """The neighbours of each of n vertices, all in faces: indices[start[v] : start[v + 1]].
+    """The neighbours of each of n vertices, in rising order: indices[start[v] : start[v + 1]].
 
     Attributes:
-        row: the vertex whose neighbours indices are.
         on_boundary: mask of the edges to them that have one face.
     """
 
     def __init__(self, faces: np.ndarray, n: int) -> None:
-        tail, head = faces.ravel(), faces[:, [1, 2, 0]].ravel()
-        forth, back = np.sort(n * tail + head), np.sort(n * head + tail)
-        if np.array_equal(forth, back):  # closed
-            keys, self.on_boundary = forth, np.zeros(len(forth), dtype=bool)
-        else:
-            keys, count = np.unique(np.concatenate([forth, back]), return_counts=True)
-            self.on_boundary = count == 1
-        self.row = keys // n
-        self.indices = keys - n * self.row
-        self.degree = np.bincount(self.row, minlength=n)
-        self.start = np.cumsum(self.degree) - self.degree
-
-    def common(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """How many neighbours vertices (N,) have in common with others (N,)."""
-        indptr = np.append(self.start, len(self.row))
-        shape = (len(self.start), len(self.start))
-        ones = csr_matrix((np.ones(len(self.row), dtype=np.int16), self.indices, indptr), shape)
-        return np.asarray(ones[one].multiply(ones[other]).sum(axis=1)).ravel()
-
-    def least(self, value: np.ndarray) -> np.ndarray:
-        """The least value (N,) over each vertex and its neighbours."""
-        return np.minimum(value, np.minimum.reduceat(value.take(self.indices), self.start))
+        self.start, self.indices, self.on_boundary = _rings(faces, n)
 
     def apart(self, priority: np.ndarray, distance: int) -> np.ndarray:
         """Mask (N,) of vertices more than ``distance`` (1 or 2) edges apart.
 
         Those with the lowest finite priority come first. The set need not be maximal.
         """
-        priority, chosen = priority.copy(), np.zeros(len(priority), dtype=bool)
-        for _ in range(3):
-            lowest = priority
-            for _ in range(distance):
-                lowest = self.least(lowest)
-            chosen |= np.isfinite(priority) & (priority == lowest)
-            near = chosen.copy()
-            for _ in range(distance):
-                near[self.indices[near[self.row]]] = True
-            priority[near] = np.inf
-        return chosen
+        return _apart(self.start, self.indices, priority.copy(), distance)
 
 
+@compiled
+def _rings(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """See :class:`Rings`."""
+    start = np.zeros(n + 1, dtype=np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            start[faces[f, k] + 1] += 2
+    for v in range(n):
+        start[v + 1] += start[v]
+    # both ends of each side of a face, of those whose number is the next in turn: each twice inside
+    heads, tails = np.empty(start[n], dtype=np.int64), np.empty(start[n], dtype=np.int64)
+    place = start.copy()
+    for f in range(len(faces)):
+        for k in range(3):
+            v = faces[f, k]
+            tails[place[v]], tails[place[v] + 1] = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            place[v] += 2
+    place = start.copy()
+    for v in range(n):
+        for q in range(start[v], start[v + 1]):
+            heads[place[tails[q]]] = v
+            place[tails[q]] += 1
+    first, count = np.zeros(n + 1, dtype=np.int64), 0
+    single = np.empty(start[n], dtype=np.bool_)
+    for v in range(n):
+        for q in range(start[v], start[v + 1]):
+            if count > first[v] and heads[count - 1] == heads[q]:
+                single[count - 1] = False
+            else:
+                heads[count], single[count] = heads[q], True
+                count += 1
+        first[v + 1] = count
+    return first, heads[:count].copy(), single[:count].copy()
+
+
+@compiled
+def _apart(
+    start: np.ndarray, indices: np.ndarray, priority: np.ndarray, distance: int
+) -> np.ndarray:
+    """See :meth:`Rings.apart`; the priorities are used up."""
+    n = len(priority)
+    chosen = np.zeros(n, dtype=np.bool_)
+    lowest, before = np.empty(n), np.empty(n)
+    for _ in range(3):
+        for v in range(n):
+            lowest[v] = priority[v]
+        for _ in range(distance):
+            for v in range(n):
+                before[v] = lowest[v]
+            for v in range(n):
+                for q in range(start[v], start[v + 1]):
+                    lowest[v] = min(lowest[v], before[indices[q]])
+        for v in range(n):
+            if priority[v] == lowest[v] and priority[v] < np.inf:
+                chosen[v] = True
+                _bar(start, indices, priority, v, distance)
+    return chosen
+
+
+@compiled
+def _bar(
+    start: np.ndarray, indices: np.ndarray, priority: np.ndarray, v: int, distance: int
+) -> None:
+    """Vertices within a distance (1 or 2) of one are not chosen any more."""
+    priority[v] = np.inf
+    for q in range(start[v], start[v + 1]):
+        w = indices[q]
+        priority[w] = np.inf
+        if distance == 2:
+            for r in range(start[w], start[w + 1]):
+                priority[indices[r]] = np.inf
+
+
+@compiled
 def _collapses(
-    points: np.ndarray, faces: np.ndarray, held: np.ndarray, rng: np.random.Generator
+    points: np.ndarray,
+    faces: np.ndarray,
+    held: np.ndarray,
+    start: np.ndarray,
+    indices: np.ndarray,
+    on_boundary: np.ndarray,
+    factor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (N,) of those at points (3, V) to collapse, their targets, and their other boundary
-    neighbours or -1."""
-    n = points.shape[1]
-    rings = Rings(faces, n)
-    row, column, on_boundary = rings.row, rings.indices, rings.on_boundary
-    boundary = np.bincount(row[on_boundary], minlength=n) > 0
-    boundary_neighbours = np.bincount(row, weights=boundary[column], minlength=n)
-    # inner vertices move onto the boundary only if that makes no chord; boundary ones stay on it
-    allowed = np.where(boundary[row], on_boundary & (boundary_neighbours[row] == 2), True)
-    allowed &= boundary[row] | ~boundary[column] | (boundary_neighbours[row] == 1)
-    allowed &= ~held[row]
-    if boundary.sum() <= _FEWEST_ON_BOUNDARY:
-        allowed &= ~boundary[row]
-    side = points.take(row, axis=1) - points.take(column, axis=1)
-    length = np.sqrt(_dot(side, side))
-    # random costs: a collapse that fails in one round is tried differently in the next
-    cost = np.where(allowed, length * rng.uniform(1.0, 1.7, len(row)), np.inf)
-    least = np.minimum.reduceat(cost, rings.start)
-    place = np.flatnonzero(np.isfinite(cost) & (cost == least[row]))
-    place = place[np.diff(row[place], prepend=-1) > 0]  # one for each vertex
-    vertex, target = row[place], column[place]
+    """What each vertex, at points (V, 3), may be collapsed onto.
 
-    good = rings.common(vertex, target) == np.where(boundary[vertex], 1, 2)
-    good &= rings.degree[vertex] + rings.degree[target] - 4 <= _MOST_NEIGHBOURS
-    vertex, target = vertex[good], target[good]
-    into = np.full(n, -1)
-    into[vertex] = target
-    bad = _leaves_bad_triangles(points, faces, into)
-    priority = np.where((into >= 0) & ~bad, least, np.inf)
-    vertex = np.flatnonzero(rings.apart(priority, 2))
-    before = np.full(n, -1)
-    other = on_boundary & (column != into[row])
-    before[row[other]] = column[other]
-    return vertex, into[vertex], np.where(boundary[vertex], before[vertex], -1)
+    Args:
+        factor: (E,) on the lengths of the edges to neighbours; the shortest of a vertex is taken.
+
+    Returns:
+        the costs (V,), infinite where nothing is good; the neighbours (V,) that it would be
+        collapsed onto; and of boundary vertices the other boundary neighbour (V,), -1 for none.
+    """
+    n = len(points)
+    boundary, around = np.zeros(n, dtype=np.bool_), 0
+    for v in range(n):
+        for q in range(start[v], start[v + 1]):
+            boundary[v] = boundary[v] or on_boundary[q]
+        around += boundary[v]
+    into, before = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    priority, mark = np.empty(n), np.empty(n, dtype=np.int64)
+    for v in range(n):
+        into[v] = before[v] = mark[v] = -1
+        priority[v] = np.inf
+    for v in range(n):
+        if held[v] or (boundary[v] and around <= _FEWEST_ON_BOUNDARY):
+            continue
+        beside = 0  # neighbours on the boundary
+        for q in range(start[v], start[v + 1]):
+            beside += boundary[indices[q]]
+            mark[indices[q]] = v
+        for q in range(start[v], start[v + 1]):
+            w = indices[q]
+            # inner vertices move onto the boundary only if that makes no chord; boundary ones stay
+            # on it
+            if boundary[v]:
+                allowed = on_boundary[q] and beside == 2
+            else:
+                allowed = not boundary[w] or beside == 1
+            if allowed:
+                square = 0.0
+                for i in range(3):
+                    square += (points[v, i] - points[w, i]) ** 2
+                cost = np.sqrt(square) * factor[q]
+                if cost < priority[v]:
+                    priority[v], into[v] = cost, w
+        if into[v] >= 0:
+            w, common = into[v], 0
+            for q in range(start[w], start[w + 1]):
+                common += mark[indices[q]] == v
+            crowd = start[v + 1] - start[v] + start[w + 1] - start[w] - 4
+            if common != 2 - boundary[v] or crowd > _MOST_NEIGHBOURS:
+                priority[v], into[v] = np.inf, -1
+        if boundary[v]:
+            for q in range(start[v], start[v + 1]):
+                if on_boundary[q] and indices[q] != into[v]:
+                    before[v] = indices[q]
+    bad = _leave_bad_triangles(points, faces, into)
+    for v in range(n):
+        if bad[v]:
+            priority[v] = np.inf
+    return priority, into, before
 
 
-def _leaves_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
-    """Mask (V,) of vertices at points (3, V) that leave bad triangles if collapsed onto others,
-    ``into``."""
-    result = np.zeros(len(into), dtype=bool)
-    corner = [points.take(faces[:, k], axis=1) for k in range(3)]
-    sides = np.stack([corner[k - 1] - corner[k - 2] for k in range(3)], axis=1)  # opposite each
-    normal = topology.cross_product(sides[:, 1], sides[:, 2])
-    double = np.sqrt(_dot(normal, normal))
-    squares = _dot(sides, sides)
-    shape = double / squares.sum(axis=0)
-    for k in range(3):
-        v, b, c = faces[:, k], faces[:, k - 2], faces[:, k - 1]
-        w = into.take(v)
-        kept = np.flatnonzero((w >= 0) & (w != b) & (w != c))
-        to = points.take(w[kept], axis=1)
-        to_b, to_c = corner[k - 2].take(kept, axis=1) - to, corner[k - 1].take(kept, axis=1) - to
-        new = topology.cross_product(to_b, to_c)
-        new_double = np.sqrt(_dot(new, new))
-        new_shape = new_double / (squares[k][kept] + _dot(to_b, to_b) + _dot(to_c, to_c))
-        bad = _dot(normal.take(kept, axis=1), new) < _TURN * new_double * double[kept]
-        bad |= new_shape < np.minimum(_SHAPE, shape[kept])
-        result[v[kept[bad]]] = True
+@compiled
+def _leave_bad_triangles(points: np.ndarray, faces: np.ndarray, into: np.ndarray) -> np.ndarray:
+    """Mask (V,) of vertices at points (V, 3) that leave bad triangles if collapsed onto others,
+    ``into`` (V,); -1 for those that stay."""
+    result = np.zeros(len(into), dtype=np.bool_)
+    old, new = np.empty(5), np.empty(5)
+    for f in range(len(faces)):
+        known = False
+        for k in range(3):
+            v, b, c = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            w = into[v]
+            if w < 0 or w in (b, c) or result[v]:
+                continue
+            if not known:
+                _measure(points, faces[f, 0], faces[f, 1], faces[f, 2], old)
+                known = True
+            _measure(points, w, b, c, new)
+            along = old[0] * new[0] + old[1] * new[1] + old[2] * new[2]
+            flat = new[4] < min(_SHAPE, old[4])
+            result[v] = flat or along < _TURN * new[3] * old[3]
     return result
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of vectors (3, ...), by coordinates."""
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+@compiled
+def _measure(points: np.ndarray, a: int, b: int, c: int, into: np.ndarray) -> None:
+    """A triangle's normal (3,), its double area, and that over its squared sides, into (5,)."""
+    squares = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        uj, uk = points[b, j] - points[a, j], points[b, k] - points[a, k]
+        vj, vk = points[c, j] - points[a, j], points[c, k] - points[a, k]
+        into[i] = uj * vk - uk * vj
+        squares += uj * uj + vj * vj + (vj - uj) * (vj - uj)
+    into[3] = np.sqrt(into[0] * into[0] + into[1] * into[1] + into[2] * into[2])
+    into[4] = into[3] / squares

@@ -2,11 +2,9 @@
 
 Tutte's embedding comes first: with uniform weights and a convex boundary it is injective for every
 mesh. SLIM (Rabinovich et al. 2017, "Scalable Locally Injective Mappings") then lowers the symmetric
-Dirichlet energy: libigl's with a fixed boundary, which is fast, and after it
-:mod:`nsm.domains.sliding`, whose boundary vertices slide along ∂Ω. The latter keeps the boundary
-exactly on ∂Ω and never flips a triangle, which libigl's soft constraints cannot promise. Large
-meshes, and those whose long thin parts exceed floating point in Tutte's embedding, are laid out
-coarse to fine (:mod:`nsm.domains.coarse_to_fine`).
+Dirichlet energy (:mod:`nsm.domains.sliding`), first with a fixed boundary, then with one that
+slides along ∂Ω. Large meshes, and those whose long thin parts exceed floating point in Tutte's
+embedding, are laid out coarse to fine (:mod:`nsm.domains.coarse_to_fine`).
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ import numpy as np
 from nsm.domains.coarse_to_fine import embed_coarse_to_fine
 from nsm.domains.planar_mesh import boundary_self_intersections, flipped_triangles
 from nsm.domains.sliding import slide
-from nsm.domains.slim import slim
 from nsm.domains.tutte import tutte
 from nsm.errors import NsmError
 from nsm.stages import at
@@ -31,11 +28,12 @@ from nsm.wording import number_of
 if TYPE_CHECKING:
     from nsm.domains.base import BoundedDomain, Keys
 
-# slim_held: SLIM without the sliding steps, a fast estimate of slim
+# slim_held: SLIM with a fixed boundary, a fast estimate of slim
 METHODS = ("tutte", "slim_held", "slim")
 GIVEN = "given"  # texture coordinates of the mesh file (:mod:`nsm.domains.given_layout`)
 # meshes with more faces than LARGE are first decimated to COARSE faces
 LARGE, COARSE = 40_000, 12_000
+MOST_HELD = 30  # steps with a fixed boundary
 FEWER = 8  # a mesh whose Tutte embedding flips triangles is decimated by this factor, or again
 
 
@@ -97,9 +95,12 @@ def embed(
         tutte_distortion = _median_distortion(vertices, faces, start)
         if method == "tutte":
             return start
-        uv = _slim_held(vertices, faces, start, loop, boundary, log)
-        steps = _sliding_steps(len(faces)) if method == "slim" else 0
-        uv = slide(vertices, faces, uv, loop, domain, steps, held)
+        steps = _steps(len(faces))
+        whole = np.zeros_like(held)
+        whole[loop] = True
+        uv = slide(vertices, faces, start, loop, domain, min(steps, MOST_HELD), whole)
+        if method == "slim":
+            uv = slide(vertices, faces, uv, loop, domain, steps, held)
         if _is_injective(uv, faces, loop):
             return uv
         log.append("SLIM's result was not injective: Tutte's embedding kept")
@@ -181,35 +182,9 @@ def _tutte_start(
     return start
 
 
-def _slim_held(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    start: np.ndarray,
-    loop: np.ndarray,
-    boundary: np.ndarray,
-    log: list[str],
-) -> np.ndarray:
-    """libigl's SLIM with a softly fixed boundary, moved exactly to ∂Ω without flips."""
-    iterations = 30 if len(faces) < 40_000 else 12
-    try:
-        solved = slim(vertices, faces, start, iterations, loop, boundary)
-    except RuntimeError as error:
-        log.append(f"libigl SLIM failed ({error}): sliding steps start from Tutte's embedding")
-        return start
-    solved[loop] = boundary
-    # shorten the way from Tutte's embedding until nothing flips
-    share = 1.0
-    for _ in range(12):
-        blend = start + share * (solved - start)
-        if np.isfinite(blend).all() and not flipped_triangles(blend, faces):
-            return blend
-        share *= 0.7
-    return start
-
-
-def _sliding_steps(n_faces: int) -> int:
-    """Number of sliding steps, such that they take seconds."""
-    return int(np.clip(800_000 / n_faces, 6, 60))
+def _steps(n_faces: int) -> int:
+    """Number of SLIM's steps, such that they take about a second."""
+    return int(np.clip(2_000_000 / n_faces, 15, 150))
 
 
 def _median_distortion(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:

@@ -2,37 +2,68 @@
 
 from __future__ import annotations
 
-from functools import cache
-from itertools import combinations
-
 import numpy as np
+
+from nsm.compiled import compiled
 
 
 def innermost(b: np.ndarray, c: np.ndarray, room: float = 1e-14) -> np.ndarray | None:
     """The point (2,) that sees all sides (K, 2) to (K, 2) of a ring, counter-clockwise, at the
     largest distance from the nearest; None if there is none with at least so much room."""
-    middle = b.mean(axis=0)
-    size = max(float((b.max(axis=0) - b.min(axis=0)).max()), 1e-300)
-    b, side = (b - middle) / size, (c - b) / size
-    length = np.maximum(np.sqrt((side * side).sum(axis=1)), 1e-300)
-    normal = np.array([-side[:, 1], side[:, 0]]).T / length[:, None]
-    # n_k p - r >= h_k: the best r is met with equality by three of the sides
-    three = _threes(len(b))
-    system = np.concatenate([normal, np.full((len(b), 1), -1.0)], axis=1)[three]
-    height = (normal * b).sum(axis=1)
-    good = np.abs(np.linalg.det(system)) > 1e-12
-    if not good.any():
-        return None
-    found = np.linalg.solve(system[good], height[three[good]][:, :, None])[:, :, 0]
-    slack = (found[:, :2] @ normal.T - height - found[:, 2:]).min(axis=1)
-    radius = np.where(slack >= -1e-9 * np.abs(found[:, 2]), found[:, 2], -np.inf)
-    best = int(radius.argmax())
-    if not radius[best] * size >= room:
-        return None
-    return np.asarray(middle + size * found[best, :2])
+    x, y, radius = _innermost(np.ascontiguousarray(b), np.ascontiguousarray(c))
+    return np.array([x, y]) if radius >= room else None
 
 
-@cache
-def _threes(count: int) -> np.ndarray:
-    """All sets (N, 3) of three of so many numbers."""
-    return np.array(list(combinations(range(count), 3)))
+@compiled
+def _innermost(b: np.ndarray, c: np.ndarray) -> tuple[float, float, float]:
+    """See :func:`innermost`: the point, and its distance from the nearest side; -∞ for none."""
+    count, size = len(b), 1e-300
+    middle, normal, height = np.zeros(2), np.empty((count, 2)), np.empty(count)
+    for i in range(2):
+        low = high = b[0, i]
+        for k in range(count):
+            low, high = min(low, b[k, i]), max(high, b[k, i])
+            middle[i] += b[k, i] / count
+        size = max(size, high - low)
+    for k in range(count):
+        x, y = (c[k, 0] - b[k, 0]) / size, (c[k, 1] - b[k, 1]) / size
+        length = max(np.sqrt(x * x + y * y), 1e-300)
+        normal[k, 0], normal[k, 1] = -y / length, x / length
+        x, y = (b[k, 0] - middle[0]) / size, (b[k, 1] - middle[1]) / size
+        height[k] = normal[k, 0] * x + normal[k, 1] * y
+    x, y, radius = _deepest(normal, height)
+    return middle[0] + size * x, middle[1] + size * y, size * radius
+
+
+@compiled
+def _deepest(normal: np.ndarray, height: np.ndarray) -> tuple[float, float, float]:
+    """The point p with the largest r such that n·p - r ≥ h for all normals n (K, 2) and heights h
+    (K,), and r; -∞ if there is none."""
+    found = 0.0, 0.0, -np.inf
+    count = len(normal)
+    # the best r is met with equality by three of the sides
+    for i in range(count):
+        for j in range(i):
+            # differences of the three equations: two for p
+            ax, ay = normal[j, 0] - normal[i, 0], normal[j, 1] - normal[i, 1]
+            a = height[j] - height[i]
+            for k in range(j):
+                bx, by = normal[k, 0] - normal[i, 0], normal[k, 1] - normal[i, 1]
+                b = height[k] - height[i]
+                det = ax * by - ay * bx
+                if not abs(det) > 1e-12:
+                    continue
+                x, y = (a * by - b * ay) / det, (ax * b - bx * a) / det
+                radius = normal[i, 0] * x + normal[i, 1] * y - height[i]
+                if not radius > found[2]:
+                    continue
+                least = -1e-9 * abs(radius)
+                sees = True
+                for s in range(count):
+                    slack = normal[s, 0] * x + normal[s, 1] * y - height[s] - radius
+                    if not slack >= least:
+                        sees = False
+                        break
+                if sees:
+                    found = x, y, radius
+    return found

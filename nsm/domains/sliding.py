@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_matrix, diags
 
-from nsm.domains.planar_mesh import cross, flipped_triangles, symmetric_dirichlet
-from nsm.domains.tutte import factorise
+from nsm.compiled import compiled
+from nsm.domains.planar_mesh import cross
+from nsm.domains.sparse_systems import Pattern
 from nsm.stages import at
 
 if TYPE_CHECKING:
@@ -35,11 +35,10 @@ def slide(
     inside, one along the boundary, none for held vertices), then searches along it for a lower
     symmetric Dirichlet energy without flips. Returns the last, lowest uv.
     """
-    inner = np.setdiff1d(np.arange(len(uv)), loop)
-    problem = _Problem(faces, *_gradients(vertices, faces), inner, loop[~held[loop]], domain)
-    energy = problem.energy(uv)
+    problem = _Problem.of(vertices, faces, loop, held, domain)
+    energy, gain = problem.energy(uv), np.inf
     for k in range(steps):
-        at("sliding along the boundary", k, steps)
+        at("SLIM", k, steps)
         direction = problem.proxy_step(uv)
         if direction is None:
             break
@@ -55,9 +54,9 @@ def slide(
             step *= 0.6
         if not improved:
             break
-        gain = (energy - value) / energy
+        before, gain = gain, (energy - value) / energy
         uv, energy = trial, value
-        if gain < 1e-5:
+        if max(before, gain) < 1e-5:  # a single step may be a short one
             break
     return uv
 
@@ -86,99 +85,216 @@ def _gradients(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 class _Problem:
     """What all steps share.
 
-    faces (F,3); gradient (F,3,2) and area (F,), see :func:`_gradients`; inner (I,) vertices, which
-    move freely, and moving (M,) ones, which slide along ∂Ω. A direction (2I + M,) holds the x, then
-    the y of the inner vertices' steps, then the lengths of the moving ones' along ∂Ω.
+    faces (F,3); gradient (F,3,2) and area (F,), see :func:`_gradients`; moving (M,) vertices, which
+    slide along ∂Ω. A direction (V, 2) holds the steps of inner vertices, and the lengths of the
+    moving ones' along ∂Ω, with a zero; free (V, 2) is the mask of what is not zero.
     """
 
     faces: np.ndarray
     gradient: np.ndarray
     area: np.ndarray
-    inner: np.ndarray
     moving: np.ndarray
+    free: np.ndarray
+    pattern: Pattern
     domain: BoundedDomain
 
-    def jacobians(self, uv: np.ndarray) -> np.ndarray:
-        return np.einsum("fki,fkj->fij", uv[self.faces], self.gradient)
+    @classmethod
+    def of(
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        loop: np.ndarray,
+        held: np.ndarray,
+        domain: BoundedDomain,
+    ) -> _Problem:
+        """That of a mesh (V, 3), (F, 3) with a boundary loop; vertices of a mask (V,) stay."""
+        moving, free = loop[~held[loop]], np.ones((len(vertices), 2), dtype=bool)
+        free[loop] = False
+        free[moving, 0] = True
+        pattern = Pattern(faces, len(vertices))
+        return cls(faces, *_gradients(vertices, faces), moving, free, pattern, domain)
 
     def energy(self, uv: np.ndarray) -> float:
         """Area-weighted symmetric Dirichlet energy of the map to the plane; inf with any flip."""
-        if flipped_triangles(uv, self.faces):
-            return float("inf")
-        jacobian = self.jacobians(uv)
-        determinant = cross(jacobian[:, :, 0], jacobian[:, :, 1])
-        norm = (jacobian**2).sum(axis=(1, 2))
-        return float(symmetric_dirichlet(self.area * norm, determinant).sum())
+        return _energy(uv, self.faces, self.gradient, self.area)
+
+    def tangents(self, uv: np.ndarray) -> np.ndarray:
+        """The unit vectors (V, 2) in which first coordinates of directions count; second ones count
+        to the left of these."""
+        result = np.zeros_like(uv)
+        result[:, 0] = 1.0
+        result[self.moving] = self.domain.tangents(uv[self.moving])
+        return result
 
     def proxy_step(self, uv: np.ndarray) -> np.ndarray | None:
         """The proxy's minimiser, a direction; None where the proxy cannot be solved."""
-        faces, gradient, inner, moving = self.faces, self.gradient, self.inner, self.moving
-        jacobian = self.jacobians(uv)
-        u, s, vt = np.linalg.svd(jacobian)
-        sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-        s = s.clip(1e-14)
-        u[:, :, 1] *= sign[:, None]
-        # weights that give the proxy the gradient of s^2 + s^-2 at this point (limit 2 at s = 1)
-        # without an upper bound: cut off, the weights of needles would no longer point downhill
-        near = np.abs(s - 1) < 1e-6
-        weight2 = np.where(near, 4.0, (s - s**-3) / np.where(near, 1.0, s - 1)).clip(1e-8)
-        w2 = np.einsum("fij,fj,fkj->fik", u, weight2, u) * self.area[:, None, None]
-        # quadratic form in the displacement d: 1/2 d'Hd + g'd, residual (J - R) at d = 0
-        force = np.einsum("fij,fjl,fkl->fki", w2, jacobian - u @ vt, gradient)  # (F,3,2)
-        dots = np.einsum("fki,fli->fkl", gradient, gradient)
-        block = np.einsum("fkl,fij->fkilj", dots, w2).reshape(len(faces), 6, 6)
-        n = len(uv)
-        index = (faces[:, :, None] * 2 + np.arange(2)).reshape(-1, 6)
-        places = (np.repeat(index, 6, axis=1).ravel(), np.tile(index, (1, 6)).ravel())
-        hessian = coo_matrix((block.ravel(), places), shape=(2 * n, 2 * n)).tocsc()
-        g = np.zeros(2 * n)
-        np.add.at(g, index.ravel(), force.ravel())
-        # columns of freedom: both coordinates inside, the tangent on the boundary
-        k, m = len(inner), len(moving)
-        values = [np.ones(2 * k), self.domain.tangents(uv[moving]).ravel()]
-        rows = [2 * inner, 2 * inner + 1, np.repeat(2 * moving, 2) + np.tile([0, 1], m)]
-        columns = [np.arange(2 * k), 2 * k + np.repeat(np.arange(m), 2)]
-        freedom = coo_matrix(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
-            shape=(2 * n, 2 * k + m),
-        ).tocsc()
-        reduced = (freedom.T @ hessian @ freedom).tocsc()
-        # slight damping: the disc may spin freely, which leaves the proxy singular
-        reduced = reduced + diags(np.full(2 * k + m, 1e-9 * reduced.diagonal().mean()))
-        try:
-            result = -factorise(reduced).solve(freedom.T @ g)
-        except RuntimeError:
+        pattern = self.pattern
+        slope, panels = np.zeros((len(pattern.ids), 2)), np.zeros(pattern.size)
+        _add_proxy(
+            uv,
+            self.faces,
+            self.gradient,
+            self.area,
+            self.tangents(uv),
+            self.free,
+            pattern.corner,
+            pattern.place,
+            pattern.width,
+            slope,
+            panels,
+        )
+        solution = pattern.solution(panels, slope, ~self.free[pattern.ids])
+        if solution is None or not np.isfinite(solution).all():
             return None
-        return result if np.isfinite(result).all() else None
+        direction = np.zeros_like(uv)
+        direction[pattern.ids] = -solution
+        return direction
 
     def collapse_step(self, uv: np.ndarray, direction: np.ndarray) -> float:
         """The step at which the first triangle loses its area (Smith and Schaefer 2015), or inf.
 
         Arcs of the boundary count as their tangents, so the search may have to shorten it still.
         """
-        k = 2 * len(self.inner)
-        displacement = np.zeros_like(uv)
-        displacement[self.inner] = direction[:k].reshape(2, -1).T
-        displacement[self.moving] = direction[k:, None] * self.domain.tangents(uv[self.moving])
-        a, b, c = (uv[self.faces[:, i]] for i in range(3))
-        da, db, dc = (displacement[self.faces[:, i]] for i in range(3))
-        # twice the area at step t is p t^2 + q t + r with r > 0
-        p = cross(db - da, dc - da)
-        q = cross(b - a, dc - da) + cross(db - da, c - a)
-        r = cross(b - a, c - a)
-        # the smallest positive root as 2r / (sqrt(q^2 - 4pr) - q), which is stable for small p
-        discriminant = q**2 - 4 * p * r
-        denominator = np.sqrt(discriminant.clip(0.0)) - q
-        collapses = (discriminant >= 0) & (denominator > 0)
-        return float((2 * r[collapses] / denominator[collapses]).min(initial=np.inf))
+        t = self.tangents(uv)
+        left = np.stack([-t[:, 1], t[:, 0]], axis=1)
+        return _collapse(uv, direction[:, :1] * t + direction[:, 1:] * left, self.faces)
 
     def moved(self, uv: np.ndarray, step: np.ndarray) -> np.ndarray:
         """uv (V,2) after a step, of the form of a direction."""
-        k = 2 * len(self.inner)
-        result = uv.copy()
-        result[self.inner] += step[:k].reshape(2, -1).T
-        result[self.moving] = self.domain.slide(uv[self.moving], step[k:])
+        result = uv + step
+        result[self.moving] = self.domain.slide(uv[self.moving], step[self.moving, 0])
         return result
+
+
+@compiled
+def _energy(uv: np.ndarray, faces: np.ndarray, gradient: np.ndarray, area: np.ndarray) -> float:
+    energy = 0.0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        side, other = uv[b, 0] - uv[a, 0], uv[c, 0] - uv[a, 0]
+        if not side * (uv[c, 1] - uv[a, 1]) - other * (uv[b, 1] - uv[a, 1]) > 0:
+            return np.inf
+        xx, xy, yx, yy = _jacobian(uv, faces, gradient, f)
+        det = xx * yy - xy * yx
+        if not det > 0:
+            return np.inf
+        energy += area[f] * (xx * xx + xy * xy + yx * yx + yy * yy) * (1 + 1 / (det * det))
+    return energy
+
+
+@compiled
+def _jacobian(
+    uv: np.ndarray, faces: np.ndarray, gradient: np.ndarray, f: int
+) -> tuple[float, float, float, float]:
+    """That of a triangle, from its frame to the plane, row by row."""
+    xx = xy = yx = yy = 0.0
+    for k in range(3):
+        u, v = uv[faces[f, k], 0], uv[faces[f, k], 1]
+        xx, xy = xx + u * gradient[f, k, 0], xy + u * gradient[f, k, 1]
+        yx, yy = yx + v * gradient[f, k, 0], yy + v * gradient[f, k, 1]
+    return xx, xy, yx, yy
+
+
+@compiled
+def _add_proxy(
+    uv: np.ndarray,
+    faces: np.ndarray,
+    gradient: np.ndarray,
+    area: np.ndarray,
+    tangent: np.ndarray,
+    free: np.ndarray,
+    corner: np.ndarray,
+    place: np.ndarray,
+    width: np.ndarray,
+    slope: np.ndarray,
+    panels: np.ndarray,
+) -> None:
+    """Add first and second derivatives of the proxy by directions; see :class:`Pattern` for the
+    last five."""
+    trace, count = 0.0, 0
+    for f in range(len(faces)):
+        xx, xy, yx, yy = _jacobian(uv, faces, gradient, f)
+        # J = U Σ Vᵀ by the sum of a rotation and a reflection, both scaled
+        e, h, g, k = 0.5 * (xx + yy), 0.5 * (yx - xy), 0.5 * (xx - yy), 0.5 * (yx + xy)
+        rotation, reflection = np.sqrt(e * e + h * h), np.sqrt(g * g + k * k)
+        large = max(rotation + reflection, 1e-14)
+        small = max((xx * yy - xy * yx) / large, 1e-14)
+        # weights that give the proxy the gradient of s² + s⁻² at this point: (s - s⁻³) / (s - 1),
+        # without an upper bound: cut off, the weights of needles would no longer point downhill
+        one, two = (
+            1 + (1 + (1 + 1 / large) / large) / large,
+            1 + (1 + (1 + 1 / small) / small) / small,
+        )
+        mean, half = 0.5 * area[f] * (one + two), 0.5 * area[f] * (one - two)
+        # U's first column is at half the angle of the rotation and the reflection together
+        length = max(rotation * reflection, 1e-300)
+        cosine, sine = (e * g - h * k) / length, (e * k + h * g) / length
+        a, b, c = mean + half * cosine, half * sine, mean - half * cosine
+        # from the nearest rotation
+        turn = max(rotation, 1e-300)
+        xx, yy, xy, yx = xx - e / turn, yy - e / turn, xy + h / turn, yx - h / turn
+        for m in range(3):
+            v, x, y = faces[f, m], gradient[f, m, 0], gradient[f, m, 1]
+            tx, ty = tangent[v, 0], tangent[v, 1]
+            dx, dy = xx * x + xy * y, yx * x + yy * y
+            fx, fy = a * dx + b * dy, b * dx + c * dy
+            if free[v, 0]:
+                slope[corner[f, m], 0] += tx * fx + ty * fy
+            if free[v, 1]:
+                slope[corner[f, m], 1] += tx * fy - ty * fx
+            for n in range(3):
+                at, w = place[f, m, n], faces[f, n]
+                if at < 0:
+                    continue
+                dot = x * gradient[f, n, 0] + y * gradient[f, n, 1]
+                sx, sy = tangent[w, 0], tangent[w, 1]
+                for j in range(2):
+                    if free[w, j]:
+                        wx, wy = dot * (a * sx + b * sy), dot * (b * sx + c * sy)
+                        for i in range(2):
+                            if free[v, i]:
+                                panels[at + j * width[f, n] + i] += (
+                                    (tx * wx + ty * wy) if i == 0 else (tx * wy - ty * wx)
+                                )
+                    sx, sy = -sy, sx
+    # slight damping: the disc may spin freely, which leaves the proxy singular
+    for twice in range(2):
+        done = np.zeros(len(slope), dtype=np.bool_)
+        for f in range(len(faces)):
+            for m in range(3):
+                if not done[corner[f, m]]:
+                    done[corner[f, m]] = True
+                    for i in range(2):
+                        if free[faces[f, m], i]:
+                            at = place[f, m, m] + i * (width[f, m] + 1)
+                            if twice == 0:
+                                trace, count = trace + panels[at], count + 1
+                            else:
+                                panels[at] += 1e-9 * trace / count
+
+
+@compiled
+def _collapse(uv: np.ndarray, change: np.ndarray, faces: np.ndarray) -> float:
+    first = np.inf
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, vx, vy = (
+            uv[b, 0] - uv[a, 0],
+            uv[b, 1] - uv[a, 1],
+            uv[c, 0] - uv[a, 0],
+            uv[c, 1] - uv[a, 1],
+        )
+        px, py = change[b, 0] - change[a, 0], change[b, 1] - change[a, 1]
+        qx, qy = change[c, 0] - change[a, 0], change[c, 1] - change[a, 1]
+        # twice the area at step t is p t^2 + q t + r with r > 0
+        p, q, r = px * qy - py * qx, ux * qy - uy * qx + px * vy - py * vx, ux * vy - uy * vx
+        # the smallest positive root as 2r / (sqrt(q^2 - 4pr) - q), which is stable for small p
+        discriminant = q * q - 4 * p * r
+        if discriminant >= 0:
+            denominator = np.sqrt(discriminant) - q
+            if denominator > 0:
+                first = min(first, 2 * r / denominator)
+    return first
 
 
 def _goes_round(polygon: np.ndarray) -> bool:

@@ -15,7 +15,8 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from nsm.domains.planar_mesh import cross, flipped, signed_areas
+from nsm.compiled import compiled
+from nsm.domains.planar_mesh import flipped, signed_areas
 from nsm.stages import counted
 from nsm.surfaces import topology
 from nsm.wording import number_of
@@ -25,7 +26,7 @@ _ROUNDS, _ITERATIONS = 20, 100
 # evaluations of a triangle's energy: so many for each triangle of the mesh, and the least allowed.
 # Meshes of which every second triangle is flipped at random take a fifth of it
 _WORK, _LEAST_WORK = 1000, 3_000_000
-_SMALL = 300  # triangles: an evaluation of fewer takes as long
+_SMALL = 300  # triangles: an evaluation of fewer counts as one of so many
 # of the area that a triangle should have: smaller ones could flip by rounding
 _ROOM = 1e-6
 # of the distance of two boundary neighbours before the map: the least after it
@@ -140,18 +141,16 @@ def _solve(
     if not (area > 0).all():
         return 0
     inverse = _cofactors(_sides(shape, faces)).transpose(0, 2, 1) / (2 * area[:, None, None])
-    mobile = np.flatnonzero(free[copies.first[vertices]])
-    moving, which = np.unique(copies.first[vertices[mobile]], return_inverse=True)
-    sign, shift = copies.sign[vertices[mobile], None], copies.shift[vertices[mobile]]
+    first = copies.first[vertices]
+    moving = np.unique(first[free[first]])
+    which = np.where(free[first], np.searchsorted(moving, first), -1)
+    sign, shift = copies.sign[vertices], copies.shift[vertices]
     trial = image[vertices]
 
-    def place(x: np.ndarray) -> None:
-        trial[mobile] = sign * x.reshape(-1, 2)[which] + shift
+    def least_determinant() -> float:
+        return float((signed_areas(trial, faces) / area).min())
 
-    def determinants() -> np.ndarray:
-        return signed_areas(trial, faces) / area
-
-    least, x = determinants().min(), image[moving]
+    least, x = least_determinant(), image[moving]
     size, spent = max(len(faces), _SMALL), 0
     for _ in range(_ROUNDS):
         if spent >= work:
@@ -160,10 +159,9 @@ def _solve(
         epsilon = np.sqrt(1e-12 + 0.04 * min(least, 0.0) ** 2)
 
         def energy(x: np.ndarray, epsilon: float = epsilon) -> tuple[float, np.ndarray]:
-            place(x)
-            value, force = _energy(trial, faces, inverse, epsilon)
+            _place(x.reshape(-1, 2), which, sign, shift, trial)
             gradient = np.zeros((len(moving), 2))
-            np.add.at(gradient, which, sign * force[mobile])
+            value = _energy(trial, faces, inverse, epsilon, which, sign, gradient)
             return value, gradient.ravel()
 
         found = minimize(
@@ -181,8 +179,8 @@ def _solve(
         if not np.isfinite(found.x).all():
             break
         x = copies.rounded(found.x.reshape(-1, 2))
-        place(x)
-        least = determinants().min()
+        _place(x, which, sign, shift, trial)
+        least = least_determinant()
         if least > _ROOM and not flipped(trial, faces).any():
             image[moving] = x
             image[vertices] = trial
@@ -209,28 +207,68 @@ def _cofactors(matrices: np.ndarray) -> np.ndarray:
     return np.stack([np.stack([d, -c], axis=1), np.stack([-b, a], axis=1)], axis=1)
 
 
+@compiled
+def _place(
+    x: np.ndarray, which: np.ndarray, sign: np.ndarray, shift: np.ndarray, points: np.ndarray
+) -> None:
+    """Put points (V, 2) where the ones that they follow are, at x (N, 2); which (V,) they are, -1
+    for points that stay."""
+    for v in range(len(points)):
+        if which[v] >= 0:
+            for i in range(2):
+                points[v, i] = sign[v] * x[which[v], i] + shift[v, i]
+
+
+@compiled
 def _energy(
-    points: np.ndarray, faces: np.ndarray, inverse: np.ndarray, epsilon: float
-) -> tuple[float, np.ndarray]:
-    """Σ (‖J‖² + det² + 1) / χ(det) over the triangles, and its gradient (V, 2).
+    points: np.ndarray,
+    faces: np.ndarray,
+    inverse: np.ndarray,
+    epsilon: float,
+    which: np.ndarray,
+    sign: np.ndarray,
+    gradient: np.ndarray,
+) -> float:
+    """Σ (‖J‖² + det² + 1) / χ(det) over the triangles (F, 3) with vertices at points (V, 2); its
+    derivatives by those that the points follow are added to the gradient (N, 2).
 
     χ(d) = (d + √(ε² + d²)) / 2 is positive, whatever d is.
     """
-    jacobian = _sides(points, faces) @ inverse
-    d = cross(jacobian[:, :, 0], jacobian[:, :, 1])
-    root = np.sqrt(epsilon**2 + d**2)
-    # for d < 0 the difference would cancel
-    chi = np.where(d > 0, 0.5 * (d + root), 0.5 * epsilon**2 / (root - np.minimum(d, 0)))
-    slope = chi / root
-    top = (jacobian**2).sum(axis=(1, 2)) + d**2 + 1
-    by_d = (2 * d - top * slope / chi) / chi
-    force = 2 * jacobian / chi[:, None, None] + by_d[:, None, None] * _cofactors(jacobian)
-    edges = force @ inverse.transpose(0, 2, 1)  # columns: by b - a and by c - a
-    gradient = np.zeros_like(points)
-    np.add.at(gradient, faces[:, 1], edges[:, :, 0])
-    np.add.at(gradient, faces[:, 2], edges[:, :, 1])
-    np.add.at(gradient, faces[:, 0], -edges.sum(axis=2))
-    return float((top / chi).sum()), gradient
+    energy = 0.0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        p, q = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
+        r, s = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
+        bx, by, cx, cy = inverse[f, 0, 0], inverse[f, 0, 1], inverse[f, 1, 0], inverse[f, 1, 1]
+        xx, xy, yx, yy = p * bx + q * cx, p * by + q * cy, r * bx + s * cx, r * by + s * cy
+        d = xx * yy - xy * yx
+        root = np.sqrt(epsilon * epsilon + d * d)
+        # for d < 0 the difference would cancel
+        chi = 0.5 * (d + root) if d > 0 else 0.5 * epsilon * epsilon / (root - d)
+        top = xx * xx + xy * xy + yx * yx + yy * yy + d * d + 1
+        energy += top / chi
+        by_d = (2 * d - top / root) / chi
+        # by the Jacobian
+        gxx, gxy = 2 * xx / chi + by_d * yy, 2 * xy / chi - by_d * yx
+        gyx, gyy = 2 * yx / chi - by_d * xy, 2 * yy / chi + by_d * xx
+        _add(
+            gradient,
+            which[a],
+            sign[a],
+            -gxx * (bx + cx) - gxy * (by + cy),
+            -gyx * (bx + cx) - gyy * (by + cy),
+        )
+        _add(gradient, which[b], sign[b], gxx * bx + gxy * by, gyx * bx + gyy * by)
+        _add(gradient, which[c], sign[c], gxx * cx + gxy * cy, gyx * cx + gyy * cy)
+    return energy
+
+
+@compiled
+def _add(gradient: np.ndarray, number: int, sign: float, x: float, y: float) -> None:
+    """Add a derivative to those of a point, if it is one that moves."""
+    if number >= 0:
+        gradient[number, 0] += sign * x
+        gradient[number, 1] += sign * y
 
 
 def order_shifts(now: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

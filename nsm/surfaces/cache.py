@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 # Increase it when the preparation changes: entries of older versions are then ignored.
-PREPARATION_VERSION = 8
+PREPARATION_VERSION = 9
 
 
 def downloads() -> ModuleType:

@@ -97,14 +97,46 @@ def test_a_mesh_without_flips_is_left_alone():
     assert (untangled(DISC, DISC_FACES, image, rim_of(DISC, DISC_FACES)) == image).all()
 
 
+@pytest.mark.parametrize("epsilon", [1e-3, 0.5])
+def test_the_gradient_is_that_of_the_energy(epsilon):
+    """Also by points that another one follows, turned around, and with flipped triangles."""
+    random = np.random.default_rng(0)
+    faces = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]])
+    inverse = random.normal(size=(len(faces), 2, 2))
+    which, sign, shift = np.array([-1, 0, 1, 2, 1]), np.array([1.0, 1, 1, 1, -1]), np.zeros((5, 2))
+    shift[4] = 2.0, -1.0
+    points, x = random.normal(size=(5, 2)), random.normal(size=(3, 2))
+
+    def energy(x):
+        untangling._place(x, which, sign, shift, points)
+        gradient = np.zeros_like(x)
+        return untangling._energy(points, faces, inverse, epsilon, which, sign, gradient), gradient
+
+    held = points[0].copy()
+    value, gradient = energy(x)
+    assert (points[0] == held).all() and (points[4] == shift[4] - x[1]).all()
+    sides = np.stack([points[faces[:, k]] - points[faces[:, 0]] for k in (1, 2)], axis=2)
+    jacobian = sides @ inverse
+    det = np.linalg.det(jacobian)
+    top = (jacobian**2).sum(axis=(1, 2)) + det**2 + 1
+    assert (det < 0).any() and (det > 0).any()
+    assert value == pytest.approx((top * 2 / (det + np.sqrt(epsilon**2 + det**2))).sum(), rel=1e-9)
+    for k in range(3):
+        for i in range(2):
+            step = np.zeros_like(x)
+            step[k, i] = 1e-6
+            slope = (energy(x + step)[0] - energy(x - step)[0]) / 2e-6
+            assert gradient[k, i] == pytest.approx(slope, rel=1e-4, abs=1e-5 * abs(gradient).max())
+
+
 def test_the_work_is_bounded(monkeypatch):
     """A rim turned inside out can never be untangled: what is evaluated stays within the bound."""
     spent = []
     of_energy = untangling._energy
 
-    def counted(points, faces, inverse, epsilon):
+    def counted(points, faces, *others):
         spent.append(max(len(faces), untangling._SMALL))
-        return of_energy(points, faces, inverse, epsilon)
+        return of_energy(points, faces, *others)
 
     monkeypatch.setattr(untangling, "_energy", counted)
     monkeypatch.setattr(untangling, "_LEAST_WORK", 0)

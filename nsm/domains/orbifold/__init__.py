@@ -5,7 +5,7 @@
 | ``embedding`` | ``embed_orbifold``, ``embed_torus``: a raw mesh to an ``Embedding``; other orders of its cones, other isotopy classes |
 | ``cones`` | extremities of a surface, and the four of them that make the least distorted domain |
 | ``lifts`` | which lift of its vertex each corner belongs to; ``group``: the symmetry group |
-| ``tutte``, ``newton``, ``sweeps``, ``collapses``, ``multiresolution`` | the layout: Tutte on a handful of triangles, then descent while the rest is put back |
+| ``tutte``, ``newton``, ``stars``, ``sweeps``, ``collapses``, ``gauges``, ``multiresolution`` | the layout: Tutte on a handful of triangles, then descent while the rest is put back |
 | ``certificate`` | whether a map to R²/Γ is a homeomorphism, exactly |
 | ``alignment``, ``collection_alignment`` | likely isotopy classes of maps between surfaces, best first |
 | ``cover`` | nearest lifts of points, and their places on the mesh |

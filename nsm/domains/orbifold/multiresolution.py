@@ -18,9 +18,10 @@ from nsm.domains.decimation import Round, coarsen, undo
 from nsm.domains.kernels import innermost
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
+from nsm.domains.orbifold.gauges import regauged
 from nsm.domains.orbifold.newton import Quotient
 from nsm.domains.orbifold.stars import Stars, seen
-from nsm.domains.orbifold.sweeps import colour_classes, relax
+from nsm.domains.orbifold.sweeps import put_back, relax
 from nsm.domains.orbifold.triangles import Triangles
 from nsm.domains.orbifold.tutte import best_lattice, edge_weights, tutte
 from nsm.errors import NsmError
@@ -30,8 +31,6 @@ from nsm.surfaces import topology
 AREA = {True: 2.0, False: 4.0}  # of the domain, with and without cones; the lattice has 4
 _LATTICE = 4.0
 _STEPS = 2  # of Newton's method on what was put back
-_NEARER = 0.7  # how far a vertex that does not fit goes towards its target, each time
-_TRIES = 3
 _SMALL = 1500  # faces of a mesh that may be relaxed after every round
 _WORST = 1e3  # times the mean: a triangle of so much energy is moved on its own
 _LEAST_ROOM = 1e-14  # between a vertex and the sides around it: less is lost in rounding
@@ -57,10 +56,7 @@ class Effort:
 
 @dataclass
 class Layout:
-    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns.
-
-    In memory, one coordinate of all vertices comes after the other: they are looked up so.
-    """
+    """A closed mesh on R²/Γ: lift (F, 3, 3), uv (V, 2) in the plane, lattice (2, 2) in columns."""
 
     lift: np.ndarray
     uv: np.ndarray
@@ -68,7 +64,7 @@ class Layout:
 
     def shaped(self, matrix: np.ndarray) -> None:
         """Apply a linear map (2, 2) to the plane."""
-        self.uv = (matrix @ self.uv.T).T
+        self.uv = self.uv @ matrix.T
         self.lattice = matrix @ self.lattice
 
 
@@ -80,7 +76,7 @@ class Level:
         mesh: its triangles.
         stars: of the vertices (N,) that are put back; None on the coarsest.
         target: (N,) what they had been drawn into.
-        weights: (2, M) of the stars' rings, mean values; those of a star add up to one.
+        weights: (M, 2) of the stars' rings, mean values; those of a star add up to one.
     """
 
     def __init__(
@@ -88,19 +84,20 @@ class Level:
     ) -> None:
         self.alive = _alive(faces)
         self._faces, self._vertices = faces[self.alive], vertices
-        self._area = area
+        self._scale = area / topology.face_areas(vertices, self._faces).sum()
         self.stars: Stars | None = None
         if step is not None:
-            mesh = scaled(vertices, self._faces, area)
-            self.stars = Stars(mesh, faces, step.vertex, step.corners, step.star)
-            middle, d = step.vertex[self.stars.star], self.stars.d
-            weights = mean_value_weights(mesh, middle, self.stars.ring, d)
-            self.weights = weights / self.stars.sums(weights.sum(axis=0))[self.stars.star]
+            stars = Stars.of(vertices, faces, self._scale, step.vertex, step.corners, step.star)
+            middle = np.repeat(stars.vertex, np.diff(stars.start))
+            weights = mean_value_weights(vertices, middle, stars.ring.T, stars.shape[:, 3])
+            total = np.add.reduceat(weights.sum(axis=0), stars.start[:-1])
+            weights /= np.repeat(total, np.diff(stars.start))
+            self.stars, self.weights = stars, np.ascontiguousarray(weights.T)
             self.target = step.target
 
     @cached_property
     def mesh(self) -> Triangles:
-        return Triangles(scaled(self._vertices, self._faces, self._area), self._faces)
+        return Triangles(self._vertices, self._faces, self._scale)
 
 
 class Levels:
@@ -116,8 +113,7 @@ class Levels:
     def __init__(
         self, vertices: np.ndarray, faces: np.ndarray, rounds: list[Round], area: float
     ) -> None:
-        self.vertices = np.asfortranarray(vertices)  # looked up by coordinates
-        self.faces, self.rounds, self.area = faces, rounds, area
+        self.vertices, self.faces, self.rounds, self.area = vertices, faces, rounds, area
 
     def __iter__(self) -> Iterator[Level]:
         # those of a small mesh are kept: more sets of cones may be tried on it
@@ -193,9 +189,9 @@ def laid_out(
     alive = _alive(levels.first.faces)
     local = np.full(len(vertices), -1)
     local[ids] = np.arange(len(ids))
-    lift = _regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
+    lift = regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
 
-    small = Layout(lift[alive], np.zeros((2, len(ids))).T, np.eye(2))
+    small = Layout(lift[alive], np.zeros((len(ids), 2)), np.eye(2))
     of_cones = None if cones is None else local[cones]
     _first(levels.second, small, of_cones, weights)
     _undone(levels.second, small, held[ids], effort)
@@ -205,7 +201,7 @@ def laid_out(
     if cones is not None:
         x[of_cones], gauge[cones] = group.CONES, group.IDENTITY
     lift = group.compose(lift, group.inverse(gauge[_clusters(len(vertices), rounds)[faces]]))
-    layout = Layout(lift, np.zeros((2, len(vertices))).T, small.lattice)
+    layout = Layout(lift, np.zeros((len(vertices), 2)), small.lattice)
     layout.uv[ids] = x @ small.lattice.T
     _undone(levels.first, layout, held, effort)
     return layout
@@ -224,7 +220,7 @@ def _undone(levels: Levels, layout: Layout, held: np.ndarray, effort: Effort) ->
     for k, level in enumerate(levels):
         count, tight = len(level.alive), False
         if level.stars is not None:
-            tight = _put_back(level, lifts, layout)
+            tight = _put_back(level, lifts, layout, held)
             if whole > _SLOW:
                 at("faces laid out", count, whole)
         last = k == len(levels.rounds)
@@ -247,15 +243,12 @@ def relax_all(
 ) -> None:
     """Lower the energy of a level's faces, by global steps or by sweeps."""
     mesh = level.mesh
-    lifts = lifts.reshape(2, 3, -1, 3).take(level.alive, axis=2).reshape(2, 3, -1)
+    lifts = lifts.reshape(-1, 3, 2, 3)[level.alive].reshape(-1, 2, 3)
     quotient = Quotient(mesh, lifts, held)
-    classes: list[tuple[Stars, np.ndarray]] = []
 
     def swept() -> np.ndarray:
         """The Jacobians after all vertices have moved on their own."""
-        classes.extend([] if classes else colour_classes(mesh, lifts, held))
-        for stars, rings in classes:
-            relax(layout.uv, layout.lattice, stars, rings)
+        relax(layout.uv, layout.lattice, mesh.stars, lifts, held)
         return quotient.jacobians(layout.uv, layout.lattice)
 
     if len(level.alive) > 2 * effort.largest:
@@ -275,7 +268,7 @@ def relax_all(
                     break
         shape = quotient.best_shape(j)
         layout.shaped(shape)
-        j = np.tensordot(shape, j, 1)
+        j = shape @ j
         layout.uv, j, energy, size = quotient.step(layout.uv, layout.lattice, j)
         stuck = size < 0.1
         if not stuck and before - energy < effort.stop * energy:
@@ -311,68 +304,17 @@ def _clusters(count: int, rounds: list[Round]) -> np.ndarray:
     return into
 
 
-def _regauged(faces: np.ndarray, lift: np.ndarray, rounds: list[Round]) -> np.ndarray:
-    """Lifts (F, 3, 3) with canonical coordinates such that a vertex and the one that it is drawn
-    into have the same lift in the triangles they share: lifts then stay as corners change names."""
-    gauge = group.identities(int(faces.max()) + 1)
-    current, into = faces.copy(), np.arange(len(gauge))
-    for step in rounds:
-        face, k = step.corners // 3, step.corners % 3
-        here = current[face] == step.target[step.star][:, None]
-        shared = np.flatnonzero(here.any(axis=1))
-        which = np.unique(step.star[shared], return_index=True)[1]
-        row = shared[which]
-        f, kv, kw = face[row], k[row], here[row].argmax(axis=1)
-
-        def now(f: np.ndarray, k: np.ndarray) -> np.ndarray:
-            return group.compose(lift[f, k], group.inverse(gauge[faces[f, k]]))
-
-        change = group.compose(group.inverse(now(f, kw)), now(f, kv))
-        number = np.full(len(gauge), -1)
-        number[step.vertex] = np.arange(len(step.vertex))
-        members = np.flatnonzero(number[into] >= 0)
-        mine = number[into[members]]
-        gauge[members] = group.compose(change[mine], gauge[members])
-        into[members] = step.target[mine]
-        current.ravel()[step.corners] = step.target[step.star]
-    return group.compose(lift, group.inverse(gauge[faces]))
-
-
-def _put_back(level: Level, lifts: np.ndarray, layout: Layout) -> bool:
+def _put_back(level: Level, lifts: np.ndarray, layout: Layout, held: np.ndarray) -> bool:
     """Give a level's last vertices places that flip no triangle; whether one was hard to find."""
     stars, uv, lattice = level.stars, layout.uv, layout.lattice
     assert stars is not None
-    own = lifts.take(stars.corners, axis=2)
-    rings = stars.rings(own, uv, lattice)
-    place = stars.sums((level.weights[:, None] * rings).sum(axis=0))
-    missing = _placed(uv, stars, stars.forms(rings), uv[level.target].T, place)
+    missing = put_back(uv, lattice, stars, lifts, level.weights, level.target)
     for number in missing.tolist():
-        b, c = rings[:, :, stars.star == number].transpose(0, 2, 1)
+        b, c = stars.ring_places(number, uv, lattice, lifts)
         at = innermost(b, c, _LEAST_ROOM)
         if at is None:
             raise NsmError("a vertex finds no place without a flip", kind="not_injective")
         uv[stars.vertex[number]] = at
     for _ in range(_STEPS):
-        relax(uv, lattice, stars, own)
+        relax(uv, lattice, stars, lifts, held)
     return len(missing) > 0
-
-
-def _placed(
-    uv: np.ndarray, stars: Stars, forms: np.ndarray, target: np.ndarray, place: np.ndarray
-) -> np.ndarray:
-    """Move each middle to its place (2, N), or as near to it from its target as it flips nothing;
-    numbers of those that found no place."""
-    missing, share = np.arange(len(stars.vertex)), 1.0
-    for _ in range(_TRIES):
-        trial = target + share * (place - target)
-        with np.errstate(all="ignore"):
-            fits = np.isfinite(stars.energy(forms, trial))
-        uv[stars.vertex[fits]] = trial[:, fits].T
-        if fits.all():
-            return missing[:0]
-        left = ~fits
-        stars, corners = stars.chosen(left)
-        forms, target, place = forms.take(corners, axis=1), target[:, left], place[:, left]
-        missing = missing[left]
-        share *= _NEARER
-    return missing

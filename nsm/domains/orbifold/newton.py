@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from nsm.compiled import compiled
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.stars import hats
 from nsm.domains.orbifold.triangles import Triangles
@@ -24,55 +25,36 @@ _DECREASE = 1e-4
 class Quotient:
     """The energy of a mesh on R²/Γ, as a function of canonical coordinates and the lattice.
 
-    Jacobians are arrays (2, 2, F), by rows and columns, each in the lift of the triangle's first
-    corner.
+    Jacobians are arrays (F, 2, 2), each in the lift of the triangle's first corner.
 
     Args:
         mesh: its triangles.
-        seen: (2, 3, 3F) of its lifts, see :func:`nsm.domains.orbifold.stars.seen`.
+        seen: (3F, 2, 3) of its lifts, see :func:`nsm.domains.orbifold.stars.seen`.
         held: (V,) mask of vertices that do not move: cones, or one vertex of a torus.
     """
 
     def __init__(self, mesh: Triangles, seen: np.ndarray, held: np.ndarray) -> None:
         self.mesh, self.held = mesh, held
-        lifts = seen[:, :, ::3]
-        self._corners = np.ascontiguousarray(mesh.faces.T)
-        self._sign = lifts[:, 0]
-        self._shift = lifts[:, 1:].transpose(1, 0, 2).reshape(2, -1)
+        self._lifts = seen[::3].copy()
 
     def jacobians(self, uv: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-        """(2, 2, F) for canonical coordinates (V, 2) in the plane and a lattice (2, 2)."""
-        return self._along(uv, (lattice @ self._shift).reshape(2, 2, -1))
-
-    def _along(self, uv: np.ndarray, shift: np.ndarray | float) -> np.ndarray:
-        """Jacobians, with places of second and third corners shifted."""
-        at = uv.T.take(self._corners, axis=1)
-        sides = self._sign * at[:, 1:] - at[:, :1] + shift
-        x, y, z = self.mesh.hats
-        return np.stack([sides[:, 0] * x, sides[:, 0] * y + sides[:, 1] * z], axis=1)
+        """(F, 2, 2) for canonical coordinates (V, 2) in the plane and a lattice (2, 2)."""
+        return _jacobians(uv, lattice, self.mesh.faces, self._lifts, self.mesh.hats)
 
     def energy(self, j: np.ndarray) -> float:
         """The energy by the Jacobians; infinite if a triangle has no area."""
-        return float(self.mesh.area @ _densities(j))
+        return _energy(j, self.mesh.area)[0]
 
     def spread(self, j: np.ndarray) -> tuple[float, float]:
         """Mean and largest energy of the triangles, per area; infinite if one has none."""
-        value = _densities(j)
-        return float(self.mesh.area @ value / self.mesh.area.sum()), float(value.max())
+        total, largest = _energy(j, self.mesh.area)
+        return total / float(self.mesh.area.sum()), largest
 
     def best_shape(self, j: np.ndarray) -> np.ndarray:
         """The matrix (2, 2), symmetric with determinant 1, that lowers the energy most if it is
         applied to the plane: tr(A²C) + tr(A⁻²D) is least at A² = √|M| M⁻¹, M = C + adj D."""
-        # C = Σ A JJᵀ; adj of Σ A J⁻ᵀ J⁻¹ = Σ A JJᵀ / det², up to a turn by a right angle in both
-        products = (j[[0, 0, 1]] * j[[0, 1, 1]]).sum(axis=1)
-        area = self.mesh.area
-        c = products @ area
-        # a few triangles that are nearly flat, for want of relaxation, do not decide
-        det = np.maximum(_det(j), _FLAT * (c[0] + c[2]) / area.sum())
-        xx, xy, yy = c + products @ (area / det**2)
-        value, vector = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-        ratio = (value[1] / value[0]) ** 0.25
-        return np.asarray(vector @ np.diag([ratio, 1 / ratio]) @ vector.T)
+        xx, xy, yy = _best_shape(j, self.mesh.area)
+        return np.array([[xx, xy], [xy, yy]])
 
     def step(
         self, uv: np.ndarray, lattice: np.ndarray, j: np.ndarray
@@ -87,19 +69,17 @@ class Quotient:
             the new coordinates (V, 2) and Jacobians, their energy, and the step's length.
         """
         start, pattern = self.energy(j), self.mesh.pattern
-        gradient, hessian = self._derivatives(j)
-        slope = self._gathered(gradient)
-        slope[self.held] = 0.0
-        direction = np.zeros_like(uv)
-        try:
-            solution = pattern.factorised(hessian, self.held).solve(slope[pattern.ids].ravel())
-        except RuntimeError:  # singular: no step
+        slope, panels = self.derivatives(j)
+        held = np.repeat(self.held[pattern.ids, None], 2, axis=1)
+        solution = pattern.solution(panels, slope, held)
+        if solution is None:  # singular: no step
             return uv, j, start, 0.0
-        direction[pattern.ids] = -solution.reshape(-1, 2)
-        change = self._along(direction, 0.0)
-        along = float((slope * direction).sum())
+        along = -float((slope * solution).sum())
         if not np.isfinite(along) or along >= 0:
             return uv, j, start, 0.0
+        direction = np.zeros_like(uv)
+        direction[pattern.ids] = -solution
+        change = self.jacobians(direction, np.zeros((2, 2)))
         size = min(1.0, _BEFORE_FLIP * _first_flip(j, change))
         for _ in range(_BACKTRACKS):
             trial = uv + size * direction
@@ -110,101 +90,188 @@ class Quotient:
             size *= 0.5
         return uv, j, start, 0.0
 
-    def _gathered(self, gradient: np.ndarray) -> np.ndarray:
-        """The gradient (V, 2) by canonical coordinates, of that (2, 3, F) by corners."""
-        corners, count = self._corners.ravel(), len(self.mesh.vertices)
-        return np.stack([np.bincount(corners, g.ravel(), count) for g in gradient], axis=1)
+    def derivatives(self, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The energy's gradient (N, 2) by the canonical coordinates of the pattern's vertices, zero
+        where they are held, and positive second derivatives, in the pattern's panels."""
+        mesh, pattern = self.mesh, self.mesh.pattern
+        slope, panels = np.zeros((len(pattern.ids), 2)), np.zeros(pattern.size)
+        _add_derivatives(
+            j,
+            mesh.hats,
+            mesh.area,
+            self._lifts,
+            pattern.corner,
+            self.held[pattern.ids],
+            pattern.place,
+            pattern.width,
+            slope,
+            panels,
+        )
+        return slope, panels
 
-    def _derivatives(self, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient (2, 3, F) and positive second derivatives (2, 2, 3, 3, F) by coordinates of
-        corners, as canonical coordinates move these."""
-        x, y, z = self.mesh.hats
-        det, area = _det(j), self.mesh.area
-        with np.errstate(all="ignore"):
-            power = 1 / (det * det)
-            inner, outer = 2 * area * (1 + power), 2 * area * power / det * (j * j).sum(axis=(0, 1))
-            cofactor = np.array([[j[1, 1], -j[1, 0]], [-j[0, 1], j[0, 0]]])
-            by_j = inner * j - outer * cofactor
-        gradient = self._by_corners(by_j[:, 0] * x + by_j[:, 1] * y, by_j[:, 1] * z)
+
+@compiled
+def _jacobians(
+    uv: np.ndarray, lattice: np.ndarray, faces: np.ndarray, lifts: np.ndarray, hats: np.ndarray
+) -> np.ndarray:
+    j = np.empty((len(faces), 2, 2))
+    for f in range(len(faces)):
+        for i in range(2):
+            here = uv[faces[f, 0], i]
+            b = lifts[f, 0, 0] * uv[faces[f, 1], i] - here
+            b += lattice[i, 0] * lifts[f, 0, 1] + lattice[i, 1] * lifts[f, 0, 2]
+            c = lifts[f, 1, 0] * uv[faces[f, 2], i] - here
+            c += lattice[i, 0] * lifts[f, 1, 1] + lattice[i, 1] * lifts[f, 1, 2]
+            j[f, i, 0] = b * hats[f, 0]
+            j[f, i, 1] = b * hats[f, 1] + c * hats[f, 2]
+    return j
+
+
+@compiled
+def _energy(j: np.ndarray, area: np.ndarray) -> tuple[float, float]:
+    """The sum over the triangles, and the largest per area; infinite if one has no area."""
+    total = largest = 0.0
+    for f in range(len(j)):
+        a, b, c, d = j[f, 0, 0], j[f, 0, 1], j[f, 1, 0], j[f, 1, 1]
+        det = a * d - b * c
+        if not det > 0:
+            return np.inf, np.inf
+        value = (a * a + b * b + c * c + d * d) * (1 + 1 / (det * det))
+        total += area[f] * value
+        largest = max(largest, value)
+    return total, largest
+
+
+@compiled
+def _best_shape(j: np.ndarray, area: np.ndarray) -> tuple[float, float, float]:
+    # C = Σ A JJᵀ; adj of Σ A J⁻ᵀ J⁻¹ = Σ A JJᵀ / det², up to a turn by a right angle in both
+    trace = whole = 0.0
+    for f in range(len(j)):
+        a, b, c, d = j[f, 0, 0], j[f, 0, 1], j[f, 1, 0], j[f, 1, 1]
+        trace += area[f] * (a * a + b * b + c * c + d * d)
+        whole += area[f]
+    # a few triangles that are nearly flat, for want of relaxation, do not decide
+    least = _FLAT * trace / whole
+    xx = xy = yy = 0.0
+    for f in range(len(j)):
+        a, b, c, d = j[f, 0, 0], j[f, 0, 1], j[f, 1, 0], j[f, 1, 1]
+        det = max(a * d - b * c, least)
+        weight = area[f] * (1 + 1 / (det * det))
+        xx += weight * (a * a + b * b)
+        xy += weight * (a * c + b * d)
+        yy += weight * (c * c + d * d)
+    # the root of a matrix P with determinant 1 is (P + I) / √(tr P + 2)
+    root = np.sqrt(xx * yy - xy * xy)
+    scale = np.sqrt((xx + yy) / root + 2)
+    return (yy / root + 1) / scale, -xy / root / scale, (xx / root + 1) / scale
+
+
+@compiled
+def _half(x: float, y: float) -> tuple[float, float]:
+    """Cosine and sine of half the angle of (x, y), up to a sign of both."""
+    length = np.hypot(x, y)
+    if length == 0:
+        return 1.0, 0.0
+    x, y = x / length, y / length
+    if x > 0:
+        c = np.sqrt(0.5 * (1 + x))
+        return c, 0.5 * y / c
+    s = np.sqrt(0.5 * (1 - x))
+    return 0.5 * y / s, s
+
+
+@compiled
+def _add_derivatives(
+    j: np.ndarray,
+    hats: np.ndarray,
+    area: np.ndarray,
+    lifts: np.ndarray,
+    corner: np.ndarray,
+    held: np.ndarray,
+    place: np.ndarray,
+    width: np.ndarray,
+    slope: np.ndarray,
+    panels: np.ndarray,
+) -> None:
+    """Add gradient and second derivatives by canonical coordinates; held is by the numbers of
+    corners."""
+    values, a, b, sign = np.empty(4), np.empty(3), np.empty(3), np.ones(3)
+    for f in range(len(j)):
+        xx, xy, yx, yy = j[f, 0, 0], j[f, 0, 1], j[f, 1, 0], j[f, 1, 1]
+        det, square = xx * yy - xy * yx, xx * xx + xy * xy + yx * yx + yy * yy
+        x, y, z = hats[f, 0], hats[f, 1], hats[f, 2]
+        sign[1], sign[2] = lifts[f, 0, 0], lifts[f, 1, 0]
+        power = 1 / (det * det)
+        inner, outer = 2 * area[f] * (1 + power), 2 * area[f] * power / det * square
+        for i in range(2):
+            by_x = inner * xx - outer * yy if i == 0 else inner * yx + outer * xy
+            by_y = inner * xy + outer * yx if i == 0 else inner * yy - outer * xx
+            second, third = by_x * x + by_y * y, by_y * z
+            slope[corner[f, 0], i] -= second + third
+            slope[corner[f, 1], i] += sign[1] * second
+            slope[corner[f, 2], i] += sign[2] * third
         # J = U Σ Vᵀ; eigenmatrices U E Vᵀ with E = e11, e22, (e21 - e12)/√2, (e21 + e12)/√2
-        (c, s), large, small, (p, q) = _singular(j, det)
-        with np.errstate(all="ignore"):
-            product, of_large, of_small = large * small, large * large, small * small
-            cube, squares = product * product * product, of_large + of_small
-            values = np.array(
-                [
-                    2 + 6 / (of_large * of_large),
-                    2 + 6 / (of_small * of_small),
-                    2 - 2 * (squares - product) / cube,
-                    2 + 2 * (squares + product) / cube,
-                ]
-            )
-        values = np.nan_to_num(values, nan=_STIFFEST, posinf=_STIFFEST).clip(1e-9, _STIFFEST)
-        one, two, skew, twist = values * area
-        mean, half = 0.5 * (skew + twist), 0.5 * (twist - skew)
+        e, h = 0.5 * (xx + yy), 0.5 * (yx - xy)
+        g, k = 0.5 * (xx - yy), 0.5 * (yx + xy)
+        turned = np.sqrt(g * g + k * k)
+        large = np.sqrt(e * e + h * h) + turned
+        small = det / large
+        if turned == 0:
+            g, k = 1.0, 0.0
+        c, s = _half(e * g - h * k, e * k + h * g)  # of U
+        p, q = _half(e * g + h * k, h * g - e * k)  # of Vᵀ
+        product, of_large, of_small = large * small, large * large, small * small
+        cube, squares = product * product * product, of_large + of_small
+        values[0] = 2 + 6 / (of_large * of_large)
+        values[1] = 2 + 6 / (of_small * of_small)
+        values[2] = 2 - 2 * (squares - product) / cube
+        values[3] = 2 + 2 * (squares + product) / cube
+        for i in range(4):
+            if not values[i] <= _STIFFEST:
+                values[i] = _STIFFEST
+            values[i] = area[f] * max(values[i], 1e-9)
+        one, two = values[0], values[1]
+        mean, half = 0.5 * (values[2] + values[3]), 0.5 * (values[3] - values[2])
         # hat functions' gradients along the columns of V
-        a, b = self._by_corners(p * x - q * y, -q * z), self._by_corners(q * x + p * y, p * z)
-        aa, bb, ba = a[:, None] * a, b[:, None] * b, b[:, None] * a
+        a[1], a[2] = sign[1] * (p * x - q * y), -sign[2] * q * z
+        b[1], b[2] = sign[1] * (q * x + p * y), sign[2] * p * z
+        a[0], b[0] = q * y - p * x + q * z, -(q * x + p * y) - p * z
         cc, ss, cs = c * c, s * s, c * s
-        both = half * (ba + ba.transpose(1, 0, 2))
-        hessian = np.empty((2, 2, *aa.shape))
-        hessian[0, 0] = (cc * one + ss * mean) * aa + (cc * mean + ss * two) * bb - cs * both
-        hessian[1, 1] = (ss * one + cc * mean) * aa + (ss * mean + cc * two) * bb + cs * both
-        hessian[0, 1] = cs * ((one - mean) * aa + (mean - two) * bb) + half * ba - ss * both
-        hessian[1, 0] = hessian[0, 1].transpose(1, 0, 2)
-        return gradient, hessian
-
-    def _by_corners(self, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-        """Values (..., 3, F) at corners that add up to zero, by those (..., F) at two of them, with
-        the signs of lifts."""
-        return np.stack([-second - third, self._sign[0] * second, self._sign[1] * third], axis=-2)
-
-
-def _det(j: np.ndarray) -> np.ndarray:
-    return np.asarray(j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0])
-
-
-def _densities(j: np.ndarray) -> np.ndarray:
-    """Energy per area (F,) of each triangle; all infinite if one has no area."""
-    det = _det(j)
-    if not (det > 0).all():
-        return np.full(len(det), np.inf)
-    with np.errstate(over="ignore", divide="ignore"):
-        return np.asarray((j * j).sum(axis=(0, 1)) * (1 + 1 / (det * det)))
+        for m in range(3):
+            for n in range(3):
+                at = place[f, m, n]
+                if at < 0 or held[corner[f, m]] or held[corner[f, n]]:
+                    continue
+                aa, bb, ba, ab = a[m] * a[n], b[m] * b[n], b[m] * a[n], a[m] * b[n]
+                both, mixed = half * (ba + ab), cs * ((one - mean) * aa + (mean - two) * bb)
+                panels[at] += (cc * one + ss * mean) * aa + (cc * mean + ss * two) * bb - cs * both
+                panels[at + 1] += mixed + half * ab - ss * both
+                at += width[f, n]
+                panels[at] += mixed + half * ba - ss * both
+                panels[at + 1] += (
+                    (ss * one + cc * mean) * aa + (ss * mean + cc * two) * bb + cs * both
+                )
+    for v in range(len(held)):
+        if held[v]:
+            slope[v] = 0.0
 
 
-def _singular(
-    j: np.ndarray, det: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """J = U Σ Vᵀ for matrices with det > 0: cosine and sine (2, F) of the rotation U, σ₁ ≥ σ₂ > 0
-    (F,), and cosine and sine of Vᵀ."""
-    e, f = 0.5 * (j[0, 0] + j[1, 1]), 0.5 * (j[0, 0] - j[1, 1])
-    g, h = 0.5 * (j[1, 0] + j[0, 1]), 0.5 * (j[1, 0] - j[0, 1])
-    large = np.sqrt(e * e + h * h) + np.sqrt(f * f + g * g)
-    one, other = np.arctan2(g, f), np.arctan2(h, e)
-    left, right = 0.5 * (other + one), 0.5 * (other - one)
-    return _turn(left), large, det / large, _turn(right)
-
-
-def _turn(angle: np.ndarray) -> np.ndarray:
-    return np.array([np.cos(angle), np.sin(angle)])
-
-
+@compiled
 def _first_flip(j: np.ndarray, change: np.ndarray) -> float:
     """The least t > 0 at which a triangle with Jacobian J + t dJ loses its area."""
-    a, c = _det(change), _det(j)
-    b = (
-        j[0, 0] * change[1, 1]
-        + j[1, 1] * change[0, 0]
-        - j[0, 1] * change[1, 0]
-        - j[1, 0] * change[0, 1]
-    )
-    root = b * b - 4 * a * c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the smallest positive root, without cancellation
-        t = 2 * c / (-b + np.sqrt(root))
-    t = t[(root >= 0) & (t > 0)]
-    return float(t.min(initial=np.inf))
+    first = np.inf
+    for f in range(len(j)):
+        xx, xy, yx, yy = j[f, 0, 0], j[f, 0, 1], j[f, 1, 0], j[f, 1, 1]
+        dxx, dxy, dyx, dyy = change[f, 0, 0], change[f, 0, 1], change[f, 1, 0], change[f, 1, 1]
+        a, c = dxx * dyy - dxy * dyx, xx * yy - xy * yx
+        b = xx * dyy + yy * dxx - xy * dyx - yx * dxy
+        root = b * b - 4 * a * c
+        if root >= 0:
+            # the smallest positive root, without cancellation
+            t = 2 * c / (np.sqrt(root) - b)
+            if 0 < t < first:
+                first = t
+    return first
 
 
 def distortions(
@@ -222,9 +289,11 @@ def distortions(
         x: (V, 2) in coordinates of the lattice (2, 2).
     """
     corner = group.moved(lift, x[faces]) @ lattice.T
-    (x, y, z), area = hats(vertices, faces, 1e-9)
+    of_face, area = hats(vertices, faces, 1e-9)
+    x, y, z = of_face.T
     b, c = (corner[:, 1:] - corner[:, :1]).transpose(1, 2, 0)
-    j = np.stack([b * x, b * y + c * z], axis=1)
-    j *= np.sqrt(area.sum() / (area * np.abs(_det(j))).sum())
-    trace, det = (j * j).sum(axis=(0, 1)), _det(j) ** 2
+    j = np.stack([b * x, b * y + c * z])
+    det = j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0]
+    scale = area.sum() / (area * np.abs(det)).sum()
+    trace, det = scale * (j * j).sum(axis=(0, 1)), (scale * det) ** 2
     return trace + (trace + 2 * epsilon) / (det + epsilon * trace + epsilon**2)

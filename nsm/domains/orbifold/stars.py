@@ -1,11 +1,12 @@
-"""Stars of vertices on R²/Γ: their energy, and Newton's step for their middles."""
+"""Stars of vertices on R²/Γ: the triangles around them, and the shapes of these on the mesh."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from nsm.domains.orbifold import group
-from nsm.surfaces import topology
+from nsm.compiled import compiled
 
 
 def hats(
@@ -17,23 +18,46 @@ def hats(
     map distorts needles, and keeping their shape would cost digits.
 
     Returns:
-        (x, y, z), (3, F): in a frame with the first corner at the origin and the second on the
+        (x, y, z), (F, 3): in a frame with the first corner at the origin and the second on the
         first axis, the second's gradient is (x, y), the third's (0, z), and all three add up to
         zero; and the areas.
     """
-    # by coordinates: on a few hundred faces, each call of numpy counts
-    a, b, c = vertices.T.take(faces.T, axis=1).transpose(1, 0, 2)
-    u, v = b - a, c - a
-    lu = np.sqrt((u * u).sum(axis=0))
-    mean = max(float(lu.sum()) / max(len(lu), 1), 1e-300)
-    lu = np.maximum(lu, 1e-9 * mean)
-    along = (u * v).sum(axis=0) / lu
-    cross = topology.cross_product(u, v)
-    double = np.sqrt((cross * cross).sum(axis=0))
-    longest = np.maximum(lu, np.sqrt((v * v).sum(axis=0)))
-    double = np.maximum(double, flattest * longest**2)
-    # the triangle (0, 0), (lu, 0), (along, double / lu)
-    return np.array([1 / lu, -along / double, lu / double]), 0.5 * double
+    return _hats(np.ascontiguousarray(vertices, dtype=np.float64), faces, flattest)
+
+
+@compiled
+def _hats(
+    vertices: np.ndarray, faces: np.ndarray, flattest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    count = len(faces)
+    of_face, area = np.empty((count, 3)), np.empty(count)
+    u, v = np.empty(3), np.empty(3)
+    total = 0.0
+    for f in range(count):
+        square = 0.0
+        for i in range(3):
+            side = vertices[faces[f, 1], i] - vertices[faces[f, 0], i]
+            square += side * side
+        of_face[f, 0] = np.sqrt(square)
+        total += of_face[f, 0]
+    least = 1e-9 * max(total / max(count, 1), 1e-300)
+    for f in range(count):
+        dot = square = 0.0
+        for i in range(3):
+            u[i] = vertices[faces[f, 1], i] - vertices[faces[f, 0], i]
+            v[i] = vertices[faces[f, 2], i] - vertices[faces[f, 0], i]
+            dot += u[i] * v[i]
+            square += v[i] * v[i]
+        length = max(of_face[f, 0], least)
+        x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+        longest = max(length, np.sqrt(square))
+        double = max(np.sqrt(x * x + y * y + z * z), flattest * longest * longest)
+        # the triangle (0, 0), (length, 0), (dot / length, double / length)
+        of_face[f, 0] = 1 / length
+        of_face[f, 1] = -dot / length / double
+        of_face[f, 2] = length / double
+        area[f] = 0.5 * double
+    return of_face, area
 
 
 def seen(lift: np.ndarray) -> np.ndarray:
@@ -43,142 +67,105 @@ def seen(lift: np.ndarray) -> np.ndarray:
         lift: (F, 3, 3).
 
     Returns:
-        (2, 3, 3F): sign and shift (s, m, n) of the corner after corner 3f + k, and of the one after
+        (3F, 2, 3): sign and shift (s, m, n) of the corner after corner 3f + k, and of the one after
         that.
     """
-    back = group.inverse(lift)
-    both = np.array([group.compose(back, lift[:, turn]) for turn in ([1, 2, 0], [2, 0, 1])])
-    return both.reshape(2, -1, 3).transpose(0, 2, 1).astype(np.float64, order="C")
+    others = lift[:, [[1, 2], [2, 0], [0, 1]]].astype(np.float64)
+    others[..., 1:] -= lift[:, :, None, 1:]
+    others *= lift[:, :, None, :1]
+    return others.reshape(-1, 2, 3)
 
 
+@compiled
+def _stars(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    scale: float,
+    vertex: np.ndarray,
+    corners: np.ndarray,
+    star: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Start, corners, ring and shape, see :class:`Stars`."""
+    count = len(corners)
+    start, place = np.zeros(len(vertex) + 1, dtype=np.int64), np.empty(len(vertex), dtype=np.int64)
+    for i in range(count):
+        start[star[i] + 1] += 1
+    for s in range(len(vertex)):
+        place[s] = start[s]
+        start[s + 1] += start[s]
+    ordered, triangles = np.empty(count, dtype=np.int64), np.empty((count, 3), dtype=np.int64)
+    ring, shape = np.empty((count, 2), dtype=np.int64), np.empty((count, 4))
+    for i in range(count):
+        at, f, k = place[star[i]], corners[i] // 3, corners[i] % 3
+        place[star[i]] += 1
+        ordered[at] = corners[i]
+        ring[at, 0], ring[at, 1] = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+        triangles[at, 0], triangles[at, 1], triangles[at, 2] = (
+            vertex[star[i]],
+            ring[at, 0],
+            ring[at, 1],
+        )
+    of_triangle, area = _hats(vertices, triangles, 1e-3)
+    for i in range(count):
+        x, z = of_triangle[i, 0], of_triangle[i, 2]
+        w = of_triangle[i, 1] + z
+        shape[i, 0], shape[i, 1] = (x * x + w * w) * area[i], -w * z * area[i]
+        shape[i, 2], shape[i, 3] = z * z * area[i], 0.5 / (scale * area[i])
+    return start, ordered, ring, shape
+
+
+@dataclass(frozen=True)
 class Stars:
-    """The triangles around some vertices (N,), no two of which are neighbours.
-
-    Args:
-        vertices: (V, 3) the mesh, scaled to the domain's area.
-        faces: (F, 3).
-        vertex: (N,) the stars' middles.
-        corners: (M,) places 3f + k of them in the faces.
-        star: (M,) which of the N each belongs to.
+    """The triangles around some vertices (N,).
 
     Attributes:
-        vertex, corners, star: as given, the corners of a star after those of the one before.
-        ring: (2, M) the triangles' other vertices b and c, counter-clockwise.
-        shape: (4, M) of triangles on the mesh: a = |g|²A, e = g·g_c A, f = |g_c|²A, with the
+        vertex: (N,) the stars' middles.
+        start: (N + 1,) where their corners begin.
+        corners: (M,) places 3f + k of the middles in the faces.
+        ring: (M, 2) the triangles' other vertices b and c, counter-clockwise.
+        shape: (M, 4) of triangles on the mesh: a = |g|²A, e = g·g_c A, f = |g_c|²A, with the
             gradients g, g_c of hat functions and the area A, and d = 1 / 2A.
     """
 
-    def __init__(
-        self,
+    vertex: np.ndarray
+    start: np.ndarray
+    corners: np.ndarray
+    ring: np.ndarray
+    shape: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
         vertices: np.ndarray,
         faces: np.ndarray,
+        scale: float,
         vertex: np.ndarray,
         corners: np.ndarray,
         star: np.ndarray,
-    ) -> None:
-        order = np.argsort(star, kind="stable")
-        self.vertex, self.corners, self.star = vertex, corners[order], star[order]
-        self._start = np.searchsorted(self.star, np.arange(len(vertex)))
-        face, k = self.corners // 3, self.corners % 3
-        self.ring = np.array([faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]])
-        (x, y, z), area = hats(vertices, np.stack([vertex[self.star], *self.ring], axis=1))
-        w = y + z
-        self.shape = np.array([(x * x + w * w) * area, -w * z * area, z * z * area, 0.5 / area])
-
-    @property
-    def d(self) -> np.ndarray:
-        """(M,) 1 / 2A."""
-        return self.shape[3]
-
-    def chosen(self, keep: np.ndarray) -> tuple[Stars, np.ndarray]:
-        """Those of the stars that a mask (N,) keeps, and which of their corners (M,) these have."""
-        mine = np.flatnonzero(keep.take(self.star))
-        new = object.__new__(Stars)
-        new.vertex, new.corners = self.vertex[keep], self.corners[mine]
-        new.star = (np.cumsum(keep) - 1)[self.star[mine]]
-        new._start = np.searchsorted(new.star, np.arange(len(new.vertex)))
-        new.ring, new.shape = self.ring.take(mine, axis=1), self.shape.take(mine, axis=1)
-        return new, mine
-
-    def split(self, ends: np.ndarray) -> list[Stars]:
-        """The stars in parts, each up to one of the numbers."""
-        parts, start = [], 0
-        corner = np.append(self._start, len(self.corners))
-        for end in ends.tolist():
-            new, mine = object.__new__(Stars), slice(corner[start], corner[end])
-            new.vertex, new.corners = self.vertex[start:end], self.corners[mine]
-            new.star, new._start = self.star[mine] - start, self._start[start:end] - mine.start
-            new.ring, new.shape = self.ring[:, mine], self.shape[:, mine]
-            parts.append(new)
-            start = end
-        return parts
-
-    def rings(self, seen: np.ndarray, uv: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-        """Places (2, 2, M) of b and c, by coordinates, each in the lift of the star's middle.
+    ) -> Stars:
+        """Those of some vertices of a mesh.
 
         Args:
-            seen: (2, 3, M) the lifts of b and c as the middle sees them.
-            uv, lattice: (V, 2) and (2, 2).
+            vertices: (V, 3).
+            faces: (F, 3).
+            scale: of areas, which makes that of the mesh the domain's.
+            vertex: (N,) the stars' middles.
+            corners: (M,) places 3f + k of them in the faces.
+            star: (M,) which of the N each belongs to.
         """
-        return seen[:, :1] * uv.T.take(self.ring, axis=1).transpose(1, 0, 2) + lattice @ seen[:, 1:]
+        return cls(vertex, *_stars(vertices, faces, scale, vertex, corners, star))
 
-    def forms(self, rings: np.ndarray) -> np.ndarray:
-        """What the energies of triangles need of the places (2, 2, M) of b and c: (7, M), b itself,
-        the gradient n of det J by the middle's place p, and 2 e y and f |y|² with y = c - b: then
-        with x = p - b, det J is n·x and A ‖J‖² is a |x|² + 2 e x·y + f |y|²."""
-        y = rings[1] - rings[0]
-        _, e, f, d = self.shape
-        forms = np.empty((7, len(self.star)))
-        forms[:2] = rings[0]
-        forms[2], forms[3] = -y[1] * d, y[0] * d
-        forms[4:6] = 2 * e * y
-        forms[6] = f * (y[0] * y[0] + y[1] * y[1])
-        return forms
+    def ring_places(
+        self, number: int, uv: np.ndarray, lattice: np.ndarray, seen: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Places (K, 2) of b and c around one star's middle, in its lift.
 
-    def energy(self, forms: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """Energy (N,) of each star with its middle at (2, N); inf where a triangle has no area."""
-        det, norm, _ = self._jacobians(forms, at)
-        good = det > 0
-        det = np.where(good, det, 1.0)
-        return self.sums(np.where(good, norm * (1 + 1 / (det * det)), np.inf))
-
-    def _jacobians(
-        self, forms: np.ndarray, at: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """det J and A ‖J‖² (M,), and x (2, M)."""
-        x = at.take(self.star, axis=1) - forms[:2]
-        squares, mixed = x * x, forms[2:6].reshape(2, 2, -1) * x
-        square = self.shape[0] * (squares[0] + squares[1])
-        det, along = mixed[:, 0] + mixed[:, 1]
-        return det, square + along + forms[6], x
-
-    def sums(self, values: np.ndarray) -> np.ndarray:
-        """Sums (..., N) over the corners of each star of values (..., M)."""
-        return np.asarray(np.add.reduceat(values, self._start, axis=-1))
-
-    def newton(self, forms: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Energy (N,) with the middles at (2, N), and Newton's steps (2, N), no triangle of which
-        loses its area before 1.25 times the step."""
-        det, q, x = self._jacobians(forms, at)
-        n, twice = forms[2:4], 2 * self.shape[0]
-        by_x = twice * x + forms[4:6]  # of q
-        power = 1 / (det * det)
-        one = 1 + power
-        first = -2 * power / det
-        mixed, second = first * by_x, 6 * q * power * power * n
-        parts = np.empty((6, len(det)))
-        parts[0] = q * one
-        parts[1:3] = one * by_x + first * q * n
-        parts[3:5] = twice * one + (2 * mixed + second) * n
-        parts[5] = mixed[0] * n[1] + (mixed[1] + second[1]) * n[0]
-        energy, gx, gy, xx, yy, xy = self.sums(parts)
-        # λ I is added where the lower eigenvalue is not clearly above zero
-        mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-        radius = np.sqrt(half * half + xy * xy)
-        shift = np.maximum(0.05 * (np.abs(mean) + radius) - (mean - radius), 0.0)
-        xx, yy = xx + shift, yy + shift
-        step = np.array([xy * gy - yy * gx, xy * gx - xx * gy]) / (xx * yy - xy * xy)
-        change = n * step.take(self.star, axis=1)
-        rate = np.maximum.reduceat(-(change[0] + change[1]) / det, self._start)
-        step *= np.minimum(1.0, 0.8 / np.maximum(rate, 1e-300))
-        return energy, step
+        Args:
+            number: of the star.
+            uv, lattice: (V, 2) and (2, 2).
+            seen: (3F, 2, 3) of the lifts.
+        """
+        mine = slice(self.start[number], self.start[number + 1])
+        lifts = seen[self.corners[mine]]
+        places = lifts[:, :, :1] * uv[self.ring[mine]] + lifts[:, :, 1:] @ lattice.T
+        return places[:, 0], places[:, 1]

@@ -63,23 +63,17 @@ def tutte(
         x[cones] = group.CONES
     free = np.flatnonzero(~held)
     right = force[free] - matrix[free] @ x
-    x[free] = factorised(matrix[free][:, free].tocsc()).solve(right)
+    x[free] = _factorised(matrix[free][:, free].tocsc()).solve(right)
     edge = gi[:, :1] * x[i] - gj[:, :1] * x[j] + gap
     return x, (edge * w[:, None]).T @ edge
 
 
-def factorised(matrix: csc_matrix, ordered: bool = False) -> SuperLU:
-    """A factorisation of a symmetric positive definite matrix.
-
-    Args:
-        matrix: the matrix.
-        ordered: whether elimination in the order of its rows fills in little; if not, another
-            order is sought.
-    """
+def _factorised(matrix: csc_matrix) -> SuperLU:
+    """A factorisation of a symmetric positive definite matrix."""
     # supernodes are not enlarged: on meshes that costs more than it saves
     return splu(
         matrix,
-        permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
+        permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         relax=1,
         panel_size=4,
