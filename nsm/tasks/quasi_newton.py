@@ -219,18 +219,17 @@ class QuasiNewton(Optimizer):
     def _metric(self, known: Sequence[Curvature]) -> Callable[[np.ndarray], np.ndarray]:
         """The inverse of K on the level, at the present coefficients."""
         matrices = [
-            [level.floor + 2 * self.smoothing * level.smoothness] * level.out_dim
+            np.tile(level.regularizer(self.smoothing), (level.out_dim, 1))
             for _, level in self._moving
         ]
         place = {id(field): k for k, (field, _) in enumerate(self._moving)}
         for curvature in known:
             field, x, blocks = curvature.of_field()
             k = place[id(field)]
-            more = self._moving[k][1].matrices(x, blocks)
-            matrices[k] = [a + b for a, b in zip(matrices[k], more, strict=True)]
+            matrices[k] += self._moving[k][1].matrices(x, blocks)
         metrics = [
-            Metric(each, level.order)
-            for each, (_, level) in zip(matrices, self._moving, strict=True)
+            Metric(level, entries)
+            for entries, (_, level) in zip(matrices, self._moving, strict=True)
         ]
 
         def solve(g: np.ndarray) -> np.ndarray:

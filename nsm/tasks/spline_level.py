@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.sparse import csc_matrix, csr_matrix, diags, identity, kron
+from scipy.sparse import csr_matrix, diags, identity, kron
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
@@ -15,10 +14,11 @@ from nsm.compiled import compiled
 from nsm.maps import SplineField
 from nsm.tasks.dissection import nested_dissection
 from nsm.tasks.multigrid import refinement_along
+from nsm.tasks.sparse_cholesky import Elimination
 
 # of H¹ beside the curvature of the loss: it decides where no point sees a coefficient
 _FLOOR = 1e-3
-_HASH = 0x9E3779B97F4A7C15 - 2**64
+_SEEN = 9  # coefficients, by a point: those of a cell
 
 
 class Level:
@@ -31,6 +31,7 @@ class Level:
     Attributes:
         grid: a spline of n cells, of one value.
         up: (rows of the field, rows of the level): the same spline's coefficients on the fine grid.
+        floor: (rows, rows), a little H¹ that the loss's curvature is added to.
         smoothness: (rows, rows), ∫ of the squared second derivatives in units of the cells' size
             to the power of -1: the mean squared change of the first derivatives over a cell.
 
@@ -54,8 +55,8 @@ class Level:
         fine = field.side**2 // 2 if field.odd else field.side**2
         self.up = (kron(along, along).tocsr() @ whole)[:fine].tocsr()
         inner, smooth = _forms(self.grid.side, cells, field.periodic)
-        self.floor = (_FLOOR * (whole.T @ inner @ whole)).tocsc()
-        self.smoothness = (whole.T @ smooth @ whole).tocsc()
+        self.floor = (_FLOOR * (whole.T @ inner @ whole)).tocsr()
+        self.smoothness = (whole.T @ smooth @ whole).tocsr()
 
     @property
     def rows(self) -> int:
@@ -63,12 +64,58 @@ class Level:
         return int(self.up.shape[1])
 
     @cached_property
-    def order(self) -> np.ndarray:
-        """An order of the rows in which factors of their matrices fill in little."""
+    def _of_cell(self) -> np.ndarray:
+        """(cells², 9) the coefficients that points of each cell see."""
+        along = torch.arange(1, 2 * self.cells, 2, dtype=torch.float64) / self.cells - 1
+        rows, _ = self.grid.seen(torch.cartesian_prod(along, along), tangents=False)
+        return rows.numpy()
+
+    @cached_property
+    def pattern(self) -> csr_matrix:
+        """(rows, rows), with an entry wherever one of the level's matrices may have one."""
+        cell = np.repeat(np.arange(self.cells**2), _SEEN)
+        ones = np.ones(len(cell))
+        sees = csr_matrix((ones, (cell, self._of_cell.ravel())), (self.cells**2, self.rows))
+        pattern = (sees.T @ sees + abs(self.floor) + abs(self.smoothness)).tocsr()
+        pattern.sum_duplicates()
+        return pattern
+
+    @cached_property
+    def elimination(self) -> Elimination:
+        """In which the level's matrices are factorised: by nested dissection."""
         row, column = np.divmod(np.arange(self.rows), self.grid.side)
         if self.grid.odd:  # the pillow's two sides lie on each other: neighbours are near
             column = np.minimum(column, self.grid.side - 1 - column)
-        return nested_dissection(self.smoothness.tocsr(), np.stack([row, column], axis=1))
+        place = np.stack([row, column], axis=1)
+        return Elimination(self.pattern, nested_dissection(self.pattern, place))
+
+    @cached_property
+    def _seen_together(self) -> tuple[np.ndarray, np.ndarray]:
+        """By the coefficient in the middle of what a point sees: the first that it sees, (rows,),
+        and where in the pattern the entries of all of them are, (rows, 9, 9). An odd spline has two
+        cells with the same middle, which see the same in reverse: that is for one of both."""
+        first = np.zeros(self.rows, dtype=np.int64)
+        place = np.zeros((self.rows, _SEEN, _SEEN), dtype=np.int32)
+        _places(self._of_cell, self.pattern.indptr, self.pattern.indices, first, place)
+        return first, place
+
+    @cached_property
+    def _entries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of the floor and of the smoothness, (nnz,) each, in the pattern."""
+        row = np.repeat(np.arange(self.rows), np.diff(self.pattern.indptr))
+        key = row * self.rows + self.pattern.indices
+        floor, smooth = np.zeros(len(key)), np.zeros(len(key))
+        for entries, matrix in ((floor, self.floor.tocoo()), (smooth, self.smoothness.tocoo())):
+            entries[np.searchsorted(key, matrix.row.astype(np.int64) * self.rows + matrix.col)] = (
+                matrix.data
+            )
+        return floor, smooth
+
+    def regularizer(self, smoothing: float) -> np.ndarray:
+        """The floor and the second derivative of ``smoothing`` times cᵀ smoothness c, by the
+        coefficients c: entries (nnz,) in the pattern."""
+        floor, smooth = self._entries
+        return floor + 2 * smoothing * smooth
 
     def restored(self, fine: np.ndarray) -> np.ndarray:
         """The level's coefficients (rows, d) of a spline of the level, given on the fine grid."""
@@ -77,7 +124,7 @@ class Level:
         normal = splu((self.up.T @ self.up).tocsc())
         return np.asarray(normal.solve(self.up.T @ fine))
 
-    def matrices(self, x: Tensor, blocks: Tensor) -> list[csc_matrix]:
+    def matrices(self, x: Tensor, blocks: Tensor) -> np.ndarray:
         """Σ Wᵀ H W over points, W their weights on the level.
 
         Args:
@@ -85,71 +132,79 @@ class Level:
             blocks: H (d, N, 3, 3), by the value and both derivatives of each component.
 
         Returns:
-            d matrices (rows, rows).
+            Entries (d, nnz), in the pattern, of d matrices.
         """
         rows, weights = self.grid.seen(x.cpu().double(), tangents=True)
-        # points of a cell see the same coefficients
-        key = (rows * (torch.arange(1, 10) * _HASH)).sum(dim=1)
-        _, cell = key.unique(return_inverse=True)
-        count = int(cell.max()) + 1
-        first = torch.empty(count, dtype=torch.int64)
-        first[cell] = torch.arange(len(cell))
-        of_cell = rows[first].numpy()
-        i = np.repeat(of_cell, 9, axis=1).ravel()
-        j = np.tile(of_cell, (1, 9)).ravel()
-        result = []
-        for block in blocks.cpu().double():
-            entries = np.zeros((count, 9, 9))
-            _add_up(cell.numpy(), weights.numpy(), block.contiguous().numpy(), entries)
-            shape = (self.rows, self.rows)
-            result.append(csr_matrix((entries.ravel(), (i, j)), shape=shape).tocsc())
-        return result
+        entries = np.zeros((len(blocks), self.pattern.nnz))
+        each = blocks.cpu().double().contiguous().numpy()
+        _add_up(rows.numpy(), weights.numpy(), each, *self._seen_together, entries)
+        return entries
 
 
 @compiled
-def _add_up(cell: np.ndarray, weights: np.ndarray, block: np.ndarray, entries: np.ndarray) -> None:
-    """Add Wᵀ H W of each point, weights (3, N, 9) and H (N, 3, 3), to the entries (cells, 9, 9) of
-    its cell (N,)."""
-    seen = np.empty((3, 9))
-    for p in range(len(cell)):
-        for a in range(3):
+def _places(
+    of_cell: np.ndarray,
+    start: np.ndarray,
+    columns: np.ndarray,
+    first: np.ndarray,
+    place: np.ndarray,
+) -> None:
+    """Fill in what :meth:`Level._seen_together` returns."""
+    for rows in of_cell:
+        middle = rows[4]
+        first[middle] = rows[0]
+        for k in range(len(rows)):
+            for m in range(len(rows)):
+                p = start[rows[k]]
+                while columns[p] != rows[m]:
+                    p += 1
+                place[middle, k, m] = p
+
+
+@compiled
+def _add_up(
+    rows: np.ndarray,
+    weights: np.ndarray,
+    blocks: np.ndarray,
+    first: np.ndarray,
+    place: np.ndarray,
+    entries: np.ndarray,
+) -> None:
+    """Add Wᵀ H W of each point, which sees rows (N, 9) with weights (3, N, 9), to entries."""
+    w, hw = np.empty((3, 9)), np.empty((3, 9))
+    for p in range(len(rows)):
+        middle = rows[p, 4]
+        turned = first[middle] != rows[p, 0]
+        for b in range(3):
             for k in range(9):
-                seen[a, k] = 0.0
-                for b in range(3):
-                    seen[a, k] += block[p, a, b] * weights[b, p, k]
-        for k in range(9):
-            for m in range(9):
-                for a in range(3):
-                    entries[cell[p], k, m] += weights[a, p, k] * seen[a, m]
+                w[b, 8 - k if turned else k] = weights[b, p, k]
+        for c in range(len(blocks)):
+            for a in range(3):
+                for k in range(9):
+                    hw[a, k] = 0.0
+                    for b in range(3):
+                        hw[a, k] += blocks[c, p, a, b] * w[b, k]
+            for k in range(9):
+                for m in range(9):
+                    more = w[0, k] * hw[0, m] + w[1, k] * hw[1, m] + w[2, k] * hw[2, m]
+                    entries[c, place[middle, k, m]] += more
 
 
 class Metric:
     """Symmetric positive definite matrices on a level's coefficients, each component apart.
 
     Args:
-        matrices: one (rows, rows) for each component.
-        order: (rows,) in which they are factorised.
+        level: whose pattern they have.
+        entries: (d, nnz) in it, of one matrix for each component.
     """
 
-    def __init__(self, matrices: Sequence[csc_matrix], order: np.ndarray) -> None:
-        self.order = order
-        # symmetric and positive: no pivoting
-        self.factors = [
-            splu(
-                matrix[order][:, order].tocsc(),
-                permc_spec="NATURAL",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-            for matrix in matrices
-        ]
+    def __init__(self, level: Level, entries: np.ndarray) -> None:
+        self.factors = [level.elimination.factors(each) for each in entries]
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """The matrices' inverses times the columns of (rows, d)."""
-        result = np.empty_like(right)
-        for k, factor in enumerate(self.factors):
-            result[self.order, k] = factor.solve(right[self.order, k])
-        return result
+        columns = zip(self.factors, right.T, strict=True)
+        return np.stack([factors.solve(column) for factors, column in columns], axis=1)
 
 
 def _whole(grid: SplineField) -> csr_matrix:

@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import csr_matrix, identity
 from scipy.sparse.linalg import splu
 
 from nsm.errors import NsmError
@@ -36,6 +37,11 @@ def filled(cells, periodic, odd, out_dim=2):
 
 def points(count=300):
     return 2 * torch.rand(count, 2, generator=torch.Generator().manual_seed(1)).double() - 1
+
+
+def whole(level, entries):
+    """A matrix from its entries in a level's pattern."""
+    return csr_matrix((entries, level.pattern.indices, level.pattern.indptr), level.pattern.shape)
 
 
 @pytest.mark.parametrize("periodic, odd", KINDS)
@@ -71,7 +77,8 @@ def test_a_levels_matrices_are_quadratic_forms_of_what_points_see(periodic, odd)
     x = points(40)
     half = torch.randn(2, 40, 3, 3, dtype=torch.float64)
     blocks = half @ half.mT
-    found = Level(field, 8).matrices(x, blocks)
+    level = Level(field, 8)
+    found = [whole(level, entries) for entries in level.matrices(x, blocks)]
     value, jacobian = field.value_and_jacobian(x)
     seen = torch.cat([value[..., None], jacobian], dim=-1)  # (N, 2, 3)
     c = field.coefficients.detach().numpy()
@@ -81,25 +88,35 @@ def test_a_levels_matrices_are_quadratic_forms_of_what_points_see(periodic, odd)
         assert abs(matrix - matrix.T).max() < 1e-9
 
 
-def test_a_metric_solves_each_component():
-    level = Level(SplineField(1, 6), 6)
-    matrices = [level.floor, level.floor + level.smoothness]
+@pytest.mark.parametrize("periodic, odd", KINDS)
+def test_a_regularizer_is_of_floor_and_smoothness(periodic, odd):
+    level = Level(SplineField(1, 6, periodic, odd), 6)
+    found = whole(level, level.regularizer(0.5))
+    assert abs(found - level.floor - level.smoothness).max() < 1e-12
+
+
+@pytest.mark.parametrize("cells", [4, 6, 22])
+@pytest.mark.parametrize("periodic, odd", KINDS)
+def test_a_metric_solves_each_component(cells, periodic, odd):
+    level = Level(SplineField(2, cells, periodic, odd), cells)
+    half = torch.randn(2, 500, 3, 3, dtype=torch.float64)
+    entries = level.regularizer(0.1) + level.matrices(points(500), half @ half.mT)
     right = np.random.default_rng(0).standard_normal((level.rows, 2))
-    solved = Metric(matrices, level.order).solve(right)
-    for k, matrix in enumerate(matrices):
-        np.testing.assert_allclose(matrix @ solved[:, k], right[:, k], atol=1e-8)
+    solved = Metric(level, entries).solve(right)
+    for k in range(2):
+        expected = splu(whole(level, entries[k]).tocsc()).solve(right[:, k])
+        np.testing.assert_allclose(solved[:, k], expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("odd", [False, True])
 def test_factors_in_a_levels_order_are_smaller_than_by_minimum_degree(odd):
     level = Level(SplineField(1, 64, periodic=odd, odd=odd), 64)
-    x = 2 * torch.rand(20_000, 2, dtype=torch.float64) - 1
-    seen = level.matrices(x, torch.eye(3, dtype=torch.float64).expand(1, len(x), 3, 3))
-    matrix = (level.floor + level.smoothness + seen[0]).tocsc()
-    assert np.array_equal(np.sort(level.order), np.arange(level.rows))
+    matrix = whole(level, np.random.default_rng(0).random(level.pattern.nnz) * 1e-3)
+    matrix = (matrix + matrix.T + identity(level.rows)).tocsc()
+    order = level.elimination.order
     options = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     least = splu(matrix, permc_spec="MMD_AT_PLUS_A", **options).L.nnz
-    assert Metric([matrix], level.order).factors[0].L.nnz < least
+    assert splu(matrix[order][:, order], permc_spec="NATURAL", **options).L.nnz < least
 
 
 def test_an_odd_spline_is_odd_and_periodic():
@@ -145,7 +162,8 @@ def test_curvature_is_the_second_difference_along_the_spline(kind, entries):
     half = torch.randn(30, entries, entries, dtype=torch.float64)
     hessians = half @ half.mT
     field, at, blocks = Curvature(h, x, hessians).of_field()
-    matrices = Level(field, 8).matrices(at, blocks)
+    level = Level(field, 8)
+    matrices = [whole(level, entries) for entries in level.matrices(at, blocks)]
 
     def seen(shift):
         with torch.no_grad():
