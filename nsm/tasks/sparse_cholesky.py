@@ -20,9 +20,9 @@ _SMALL = 1e-14  # a pivot this small, beside the entry that it comes from, is a 
 class Elimination:
     """The fronts in which matrices of one pattern are factorised.
 
-    Front s eliminates one of the given parts of the unknowns. Its own rows of the factor are dense:
-    a panel, with columns for these unknowns and for those that come later and are linked to them,
-    also through what was eliminated before.
+    Front s eliminates one of the given parts of the unknowns. Its own rows are dense: a panel, with
+    columns for these unknowns and for those that come later and are linked to them, also through
+    what was eliminated before.
 
     Args:
         graph: (N, N), with an entry wherever one of the matrices has one, on the diagonal and on
@@ -32,7 +32,7 @@ class Elimination:
 
     Attributes:
         order: (N,) the unknowns, as they are eliminated.
-        size: of all panels, entries below the diagonal included.
+        size: how many entries the factors have.
     """
 
     def __init__(self, graph: csr_matrix, parts: Sequence[np.ndarray]) -> None:
@@ -45,8 +45,7 @@ class Elimination:
         self._row = np.concatenate(rows)
         self._first = np.cumsum([0, *map(len, rows)])
         own, width = np.diff(self._begin), np.diff(self._first)
-        self._panel = np.concatenate([[0], np.cumsum(own * width)])
-        self.size = int(self._panel[-1])
+        self.size = int((own * width - own * (own - 1) // 2).sum())
         self._into, self._relative = np.full(len(parts), -1), np.zeros_like(self._row)
         # What is left is kept on two stacks, in turn from front to front up the tree: so a front
         # is made on the one while its children, which go up in it, are on the other. Each begins
@@ -61,9 +60,10 @@ class Elimination:
                 self._relative[left] = np.searchsorted(rows[s], self._row[left])
             height[1 - side[s]] = max(height[1 - side[s]], top)
         self._kept += side * height[0]
-        self._room = int(height.sum())
-        start, columns = graph.indptr.astype(np.int64), number[graph.indices]
-        self._place = _places(start, columns, number, self._begin, self._first, self._row)
+        self._room = np.array([height.sum(), (own * width).max()])
+        self._start, columns = graph.indptr.astype(np.int64), number[graph.indices]
+        shape = self._begin, self._first, self._row
+        self._place = _places(self._start, columns, self.order, *shape)
 
     def _fronts(
         self, graph: csr_matrix, number: np.ndarray
@@ -101,25 +101,23 @@ class Elimination:
                 to 1 if that is not positive either: so the factors are always those of a positive
                 definite matrix.
         """
-        panels = np.zeros(self.size)
-        _put(panels, entries, self._place)
-        shape = self._begin, self._first, self._panel
-        _factorise(panels, *shape, self._into, self._relative, self._kept, self._room)
-        return Factors(self.order, panels, (*shape, self._row))
+        rows = np.empty(self.size)
+        matrix = entries, self._start, self._place, self.order
+        tree = self._begin, self._first, self._into, self._relative, self._kept, self._room
+        _factorise(rows, *matrix, *tree)
+        return Factors(rows, self.order, self._begin, self._first, self._row)
 
 
 class Factors:
     """The Cholesky factors of a matrix, made by :meth:`Elimination.factors`."""
 
-    def __init__(
-        self, order: np.ndarray, panels: np.ndarray, shape: tuple[np.ndarray, ...]
-    ) -> None:
-        self._order, self._panels, self._shape = order, panels, shape
+    def __init__(self, rows: np.ndarray, order: np.ndarray, *fronts: np.ndarray) -> None:
+        self._rows, self._order, self._fronts = rows, order, fronts
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """The inverse of the matrix times (N,)."""
         x, result = right[self._order], np.empty(len(right))
-        _solve(self._panels, x, *self._shape)
+        _solve(self._rows, x, *self._fronts)
         result[self._order] = x
         return result
 
@@ -128,53 +126,55 @@ class Factors:
 def _places(
     start: np.ndarray,
     columns: np.ndarray,
-    number: np.ndarray,
+    order: np.ndarray,
     begin: np.ndarray,
     first: np.ndarray,
     row: np.ndarray,
 ) -> np.ndarray:
-    """Where in the panels the entries of a graph go, (nnz,); -1 for those below the diagonal."""
-    unknown, place = np.empty_like(number), np.empty_like(columns)
-    for i in range(len(number)):
-        unknown[number[i]] = i
-    column_of, panel = np.empty_like(number), 0
+    """Where in the panel of their front the entries of a graph go, (nnz,); -1 for those below the
+    diagonal."""
+    place, column_of = np.empty_like(columns), np.empty_like(order)
     for s in range(len(begin) - 1):
         width = first[s + 1] - first[s]
         for q in range(width):
             column_of[row[first[s] + q]] = q
         for j in range(begin[s], begin[s + 1]):
-            for p in range(start[unknown[j]], start[unknown[j] + 1]):
-                place[p] = panel + column_of[columns[p]] if columns[p] >= j else -1
-            panel += width
+            at = (j - begin[s]) * width
+            for p in range(start[order[j]], start[order[j] + 1]):
+                place[p] = at + column_of[columns[p]] if columns[p] >= j else -1
     return place
 
 
 @compiled
-def _put(panels: np.ndarray, entries: np.ndarray, place: np.ndarray) -> None:
-    for p in range(len(place)):
-        if place[p] >= 0:
-            panels[place[p]] = entries[p]
-
-
-@compiled
 def _factorise(
-    panels: np.ndarray,
+    factor: np.ndarray,
+    entries: np.ndarray,
+    start: np.ndarray,
+    place: np.ndarray,
+    order: np.ndarray,
     begin: np.ndarray,
     first: np.ndarray,
-    panel: np.ndarray,
     into: np.ndarray,
     relative: np.ndarray,
     kept: np.ndarray,
-    room: int,
+    room: np.ndarray,
 ) -> None:
-    """Replace a matrix, in its panels, by the upper factor, with inverse pivots."""
-    left, given = np.empty(room), np.empty(begin[-1])
+    """Fill in the rows of the upper factor one after the other, each from its pivot on, which is
+    inverse."""
+    left, panel, done = np.empty(room[0]), np.empty(room[1]), 0
+    given = np.empty(len(order))
     child, sibling = np.full(len(into), -1), np.full(len(into), -1)
     for s in range(len(into)):
         own, width = begin[s + 1] - begin[s], first[s + 1] - first[s]
         rest = width - own
+        for at in range(own * width):
+            panel[at] = 0.0
         for q in range(own):
-            given[begin[s] + q] = panels[panel[s] + q * (width + 1)]
+            unknown = order[begin[s] + q]
+            for p in range(start[unknown], start[unknown + 1]):
+                if place[p] >= 0:
+                    panel[place[p]] = entries[p]
+            given[q] = panel[q * (width + 1)]
         for i in range(rest):
             for at in range(kept[s] + i * (rest + 1), kept[s] + (i + 1) * rest):
                 left[at] = 0.0
@@ -184,8 +184,7 @@ def _factorise(
             for i in range(len(columns)):
                 source = left[kept[c] + i * len(columns) : kept[c] + (i + 1) * len(columns)]
                 if columns[i] < own:
-                    at = panel[s] + columns[i] * width
-                    there = panels[at : at + width]
+                    there = panel[columns[i] * width : (columns[i] + 1) * width]
                     for j in range(i, len(columns)):
                         there[columns[j]] += source[j]
                 else:
@@ -195,58 +194,60 @@ def _factorise(
                         there[columns[j] - own] += source[j]
             c = sibling[c]
         for block in range(0, own, 8):
-            above, count = panel[s] + block * width, min(8, own - block)
+            above, count = block * width, min(8, own - block)
             for q in range(block, block + count):
-                u = panels[panel[s] + q * (width + 1) : panel[s] + (q + 1) * width]
-                _less(u, panels, above + q, width, q - block)
-                whole = given[begin[s] + q]
-                if u[0] > _SMALL * whole:
+                u = panel[q * (width + 1) : (q + 1) * width]
+                _less(u, panel, above + q, width, q - block)
+                if u[0] > _SMALL * given[q]:
                     inverse = 1 / np.sqrt(u[0])
                     u[0] = inverse
-                    for r in range(1, width - q):
+                    for r in range(1, len(u)):
                         u[r] *= inverse
                 else:
-                    u[0] = 1 / np.sqrt(whole) if whole > 0 else 1.0
-                    for r in range(1, width - q):
+                    u[0] = 1 / np.sqrt(given[q]) if given[q] > 0 else 1.0
+                    for r in range(1, len(u)):
                         u[r] = 0.0
+                for r in range(len(u)):
+                    factor[done + r] = u[r]
+                done += len(u)
             for q in range(block + count, own):
-                u = panels[panel[s] + q * (width + 1) : panel[s] + (q + 1) * width]
-                _less(u, panels, above + q, width, count)
+                u = panel[q * (width + 1) : (q + 1) * width]
+                _less(u, panel, above + q, width, count)
             for q in range(rest):
                 u = left[kept[s] + q * (rest + 1) : kept[s] + (q + 1) * rest]
-                _less(u, panels, above + own + q, width, count)
+                _less(u, panel, above + own + q, width, count)
         if into[s] >= 0:
             sibling[s], child[into[s]] = child[into[s]], s
 
 
 @compiled
-def _less(u: np.ndarray, panels: np.ndarray, at: int, width: int, count: int) -> None:
+def _less(u: np.ndarray, panel: np.ndarray, at: int, width: int, count: int) -> None:
     """Take from the row of a pivot what up to 8 rows of a panel take: those from a place on, where
     the first has its entry in the pivot's column."""
     n = len(u)
     if count == 8:  # the others are few
-        a, b = panels[at : at + n], panels[at + width : at + width + n]
+        a, b = panel[at : at + n], panel[at + width : at + width + n]
         at += 2 * width
-        c, d = panels[at : at + n], panels[at + width : at + width + n]
+        c, d = panel[at : at + n], panel[at + width : at + width + n]
         at += 2 * width
-        e, f = panels[at : at + n], panels[at + width : at + width + n]
+        e, f = panel[at : at + n], panel[at + width : at + width + n]
         at += 2 * width
-        g, h = panels[at : at + n], panels[at + width : at + width + n]
+        g, h = panel[at : at + n], panel[at + width : at + width + n]
         ua, ub, uc, ud, ue, uf, ug, uh = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]
         for r in range(n):
             first = ua * a[r] + ub * b[r] + uc * c[r] + ud * d[r]
             u[r] -= first + (ue * e[r] + uf * f[r] + ug * g[r] + uh * h[r])
         return
     if count >= 4:
-        a, b = panels[at : at + n], panels[at + width : at + width + n]
+        a, b = panel[at : at + n], panel[at + width : at + width + n]
         at += 2 * width
-        c, d = panels[at : at + n], panels[at + width : at + width + n]
+        c, d = panel[at : at + n], panel[at + width : at + width + n]
         at += 2 * width
         ua, ub, uc, ud = a[0], b[0], c[0], d[0]
         for r in range(n):
             u[r] -= ua * a[r] + ub * b[r] + uc * c[r] + ud * d[r]
     for _ in range(count % 4):
-        a = panels[at : at + n]
+        a = panel[at : at + n]
         ua = a[0]
         for r in range(n):
             u[r] -= ua * a[r]
@@ -255,69 +256,55 @@ def _less(u: np.ndarray, panels: np.ndarray, at: int, width: int, count: int) ->
 
 @compiled
 def _solve(
-    panels: np.ndarray,
+    factor: np.ndarray,
     x: np.ndarray,
     begin: np.ndarray,
     first: np.ndarray,
-    panel: np.ndarray,
     row: np.ndarray,
 ) -> None:
-    """Replace a right-hand side (N,) by the solution."""
-    y = np.empty(len(x))  # of a front
+    """Replace a right-hand side (N,) by the solution.
+
+    The factor is read in one go, forth and back: that is as fast as memory is.
+    """
+    y, at = np.empty(len(x)), 0  # y: of a front
     for s in range(len(begin) - 1):
         own, width = begin[s + 1] - begin[s], first[s + 1] - first[s]
-        rows, q = row[first[s] : first[s + 1]], 0
-        for r in range(width):
-            y[r] = x[rows[r]]
-        while q < own:
-            at = panel[s] + q * width
-            if q + 4 <= own:
-                a, b = panels[at : at + width], panels[at + width : at + 2 * width]
-                at += 2 * width
-                c, d = panels[at : at + width], panels[at + width : at + 2 * width]
-                ya = y[q] * a[q]
-                yb = (y[q + 1] - ya * a[q + 1]) * b[q + 1]
-                yc = (y[q + 2] - ya * a[q + 2] - yb * b[q + 2]) * c[q + 2]
-                yd = (y[q + 3] - ya * a[q + 3] - yb * b[q + 3] - yc * c[q + 3]) * d[q + 3]
-                y[q], y[q + 1], y[q + 2], y[q + 3] = ya, yb, yc, yd
-                for r in range(q + 4, width):
-                    y[r] -= ya * a[r] + yb * b[r] + yc * c[r] + yd * d[r]
-                q += 4
-            else:
-                y[q] *= panels[at + q]
-                for r in range(q + 1, width):
-                    y[r] -= y[q] * panels[at + r]
-                q += 1
-        for r in range(width):
-            x[rows[r]] = y[r]
-    for s in range(len(begin) - 2, -1, -1):
-        q, width = begin[s + 1] - begin[s], first[s + 1] - first[s]
         rows = row[first[s] : first[s + 1]]
         for r in range(width):
             y[r] = x[rows[r]]
-        while q > 0:
-            if q >= 4:
-                q -= 4
-                at = panel[s] + q * width
-                a, b = panels[at : at + width], panels[at + width : at + 2 * width]
-                at += 2 * width
-                c, d = panels[at : at + width], panels[at + width : at + 2 * width]
-                ya, yb, yc, yd = y[q], y[q + 1], y[q + 2], y[q + 3]
-                for r in range(q + 4, width):
-                    ya -= a[r] * y[r]
-                    yb -= b[r] * y[r]
-                    yc -= c[r] * y[r]
-                    yd -= d[r] * y[r]
-                yd *= d[q + 3]
-                yc = (yc - c[q + 3] * yd) * c[q + 2]
-                yb = (yb - b[q + 3] * yd - b[q + 2] * yc) * b[q + 1]
-                ya = (ya - a[q + 3] * yd - a[q + 2] * yc - a[q + 1] * yb) * a[q]
-                y[q], y[q + 1], y[q + 2], y[q + 3] = ya, yb, yc, yd
-            else:
-                q -= 1
-                at = panel[s] + q * width
-                for r in range(q + 1, width):
-                    y[q] -= panels[at + r] * y[r]
-                y[q] *= panels[at + q]
-        for r in range(begin[s + 1] - begin[s]):
+        for q in range(own):
+            z, u = y[q:width], factor[at : at + width - q]
+            value = z[0] * u[0]
+            for r in range(1, len(z)):
+                z[r] -= value * u[r]
+            z[0] = value
+            at += len(z)
+        for r in range(width):
+            x[rows[r]] = y[r]
+    for s in range(len(begin) - 2, -1, -1):
+        own, width = begin[s + 1] - begin[s], first[s + 1] - first[s]
+        rows = row[first[s] : first[s + 1]]
+        for r in range(width):
+            y[r] = x[rows[r]]
+        for q in range(own - 1, -1, -1):
+            z, n = y[q:width], width - q
+            at -= n
+            u = factor[at : at + n]
+            # eight sums at once: one would wait for each of its additions
+            a = b = c = d = e = f = g = h = 0.0
+            for k in range((n - 1) // 8):
+                v, w = u[n - 8 * k - 8 : n - 8 * k], z[n - 8 * k - 8 : n - 8 * k]
+                a += v[0] * w[0]
+                b += v[1] * w[1]
+                c += v[2] * w[2]
+                d += v[3] * w[3]
+                e += v[4] * w[4]
+                f += v[5] * w[5]
+                g += v[6] * w[6]
+                h += v[7] * w[7]
+            value = z[0] - ((a + b) + (c + d)) - ((e + f) + (g + h))
+            for r in range(1, n - 8 * ((n - 1) // 8)):
+                value -= u[r] * z[r]
+            z[0] = value * u[0]
+        for r in range(own):
             x[rows[r]] = y[r]

@@ -103,12 +103,11 @@ class Level:
     def _entries(self) -> tuple[np.ndarray, np.ndarray]:
         """Those of the floor and of the smoothness, (nnz,) each, in the pattern."""
         row = np.repeat(np.arange(self.rows), np.diff(self.pattern.indptr))
-        key = row * self.rows + self.pattern.indices
+        key = row * self.rows + self.pattern.indices  # rises
         floor, smooth = np.zeros(len(key)), np.zeros(len(key))
         for entries, matrix in ((floor, self.floor.tocoo()), (smooth, self.smoothness.tocoo())):
-            entries[np.searchsorted(key, matrix.row.astype(np.int64) * self.rows + matrix.col)] = (
-                matrix.data
-            )
+            place = np.searchsorted(key, matrix.row.astype(np.int64) * self.rows + matrix.col)
+            entries[place] = matrix.data
         return floor, smooth
 
     def regularizer(self, smoothing: float) -> np.ndarray:
