@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -22,6 +21,8 @@ _ON_BOUNDARY = 1e-6
 _FIRST = 1e-3
 # factor of λ_C at triangles, where few steps are left to meet the landmarks
 _LAST = 10.0
+# more than any value that is reached, and finite as all of a checkpoint
+_NEVER = torch.finfo(torch.float32).max
 _MET = 0.02  # in percent of the target's diagonal: landmarks that are nearer are met
 # in units of Ω: where there is a seam, a landmark that is farther off once λ_C is in full lies on
 # the other side of it; more force only folds the map
@@ -93,8 +94,8 @@ class ConstrainedMap(AtTriangles):
         self.held_out = HeldOut()
         self.weighed = 0.0  # λ_C of the step that is made
         self.distortion: Tensor | None = None
-        self.register_buffer("reached", torch.tensor(math.inf))  # at the end of the last step
-        self.register_buffer("flipped", torch.tensor(math.inf))  # and then, in percent
+        self.register_buffer("reached", torch.tensor(_NEVER))  # at the end of the last step
+        self.register_buffer("flipped", torch.tensor(_NEVER))  # and then, in percent
         self.register_buffer("settled", torch.tensor(False))
         self.ramp_steps = self.constraints.ramp * max_steps
         self.multipliers_from = self.constraints.multipliers_from * max_steps
@@ -244,7 +245,7 @@ class ConstrainedMap(AtTriangles):
         self.loss_weights = stronger(self.loss_weights)
         self.ramp_steps = self.multipliers_from = 0.0
         for reached in (self.reached, self.flipped):
-            reached.fill_(math.inf)
+            reached.fill_(_NEVER)
         self.settled.fill_(False)
         further_training(self, steps)
 
