@@ -1,5 +1,7 @@
 """Compiled functions: told while they are compiled, kept, and made anew where nothing is kept."""
 
+import gc
+
 import numpy as np
 
 from nsm import stages
@@ -17,6 +19,7 @@ def test_who_waits_is_told_that_a_function_is_compiled(monkeypatch):
     twice, x = compiled(double), np.ones(3)
     twice.recompile() if twice.signatures else twice(x)
     assert said[0].startswith("compiling") and said[-1] == ""
+    assert gc.isenabled()
 
 
 def test_what_a_step_waits_for_is_in_its_line():
