@@ -204,10 +204,10 @@ def section(results: dict[str, Any]) -> list[str]:
         "## From raw files to the last file written",
         "",
         f"CPU seconds of each stage on {results['machine']}, one thread, with an empty cache of "
-        "surfaces and compiled loops (`make bench-waiting MESHES=FOLDER`). Maps are from shrec07-384 to shrec07-388 with 21 "
-        "landmarks; their neural surfaces are made side by side, so that the wait by the clock is "
-        "shorter. The neural surface and the flattening are of shrec07-384; by "
-        f"experiment=fit, of {LARGER}, which has 9,757 vertices.",
+        "surfaces and compiled loops (`make bench-waiting MESHES=FOLDER`). Maps are from "
+        "shrec07-384 to shrec07-388 with 21 landmarks; their neural surfaces are made side by "
+        "side, so that the wait by the clock is shorter. The neural surface and the flattening are "
+        f"of shrec07-384; by experiment=fit, of {LARGER}, which has 9,757 vertices.",
         "",
         "| stage | " + " | ".join(CASES[name] for name in cases) + " |",
         "|---" * (len(cases) + 1) + "|",
