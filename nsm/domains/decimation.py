@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsm.compiled import compiled
+from nsm.domains.sides import ends_of_sides
 from nsm.surfaces import topology
 
 # A new triangle's normal may turn by 70°, and its double area over its squared sides (0.29 if they
@@ -64,7 +65,7 @@ def coarsen(
     Returns:
         The faces (F, 3), where removed ones have two equal corners; and the rounds.
     """
-    faces, alive = faces.copy(), np.flatnonzero(_has_area(faces))
+    faces, alive = faces.copy(), np.flatnonzero(has_area(faces))
     ids, local = topology.renumbered(faces[alive], len(vertices))
     left = local[faces[alive]]  # the faces that are left, by the numbers of their vertices in ids
     rng = np.random.default_rng(0)
@@ -86,7 +87,7 @@ def coarsen(
         other = np.where(before[vertex] < 0, -1, ids[before[vertex]])
         star = np.searchsorted(vertex, moved)
         rounds.append(Round(ids[vertex], ids[into[vertex]], other, corners, star))
-        keep = _has_area(left)
+        keep = has_area(left)
         alive, left = alive[keep], left[keep]
         used, local = topology.renumbered(left, len(ids))
         ids, left = ids[used], local[left]
@@ -112,10 +113,11 @@ def finer(faces: np.ndarray, rounds: list[Round], count: int) -> np.ndarray:
 
 def present_faces(faces: np.ndarray) -> np.ndarray:
     """Those of the faces (F, 3) that are not removed."""
-    return faces[_has_area(faces)]
+    return faces[has_area(faces)]
 
 
-def _has_area(faces: np.ndarray) -> np.ndarray:
+def has_area(faces: np.ndarray) -> np.ndarray:
+    """Mask (F,) of the faces (F, 3) that are there: those removed have two equal corners."""
     a, b, c = faces.T
     return (a != b) & (b != c) & (c != a)
 
@@ -128,7 +130,7 @@ class Rings:
     """
 
     def __init__(self, faces: np.ndarray, n: int) -> None:
-        self.start, self.indices, self.on_boundary = _rings(faces, n)
+        self.start, self.indices, self.on_boundary = _rings(*ends_of_sides(faces, n))
 
     def apart(self, priority: np.ndarray, distance: int) -> np.ndarray:
         """Mask (N,) of vertices more than ``distance`` (1 or 2) edges apart.
@@ -139,22 +141,10 @@ class Rings:
 
 
 @compiled
-def _rings(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """See :class:`Rings`."""
-    start = np.zeros(n + 1, dtype=np.int64)
-    for f in range(len(faces)):
-        for k in range(3):
-            start[faces[f, k] + 1] += 2
-    for v in range(n):
-        start[v + 1] += start[v]
-    # both ends of each side of a face, of those whose number is the next in turn: each twice inside
-    heads, tails = np.empty(start[n], dtype=np.int64), np.empty(start[n], dtype=np.int64)
-    place = start.copy()
-    for f in range(len(faces)):
-        for k in range(3):
-            v = faces[f, k]
-            tails[place[v]], tails[place[v] + 1] = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
-            place[v] += 2
+def _rings(start: np.ndarray, tails: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """See :class:`Rings`; start and tails are those of :func:`ends_of_sides`."""
+    n, heads = len(start) - 1, np.empty(len(tails), dtype=np.int64)
+    # by their ends, those of each in rising order
     place = start.copy()
     for v in range(n):
         for q in range(start[v], start[v + 1]):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nsm.compiled import compiled
+from nsm.domains.sides import ends_of_sides
 
 
 class Fronts(NamedTuple):
@@ -45,7 +46,8 @@ class Fronts(NamedTuple):
 
 def fronts(faces: np.ndarray, n: int) -> Fronts:
     """Those of the vertices (N,) of faces (F, 3), in an order in which little is filled in."""
-    start, end, beside = _neighbours(faces, n)
+    start, beside = ends_of_sides(faces, n)
+    end = _each_once(start, beside)
     order = _elimination_order(start, end.copy(), beside.copy())
     return Fronts(*_fronts(start, end, beside, order))
 
@@ -311,22 +313,10 @@ def _none(n: int) -> np.ndarray:
 
 
 @compiled
-def _neighbours(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The neighbours of each vertex, from start (N + 1,) to end (N,)."""
-    start = np.zeros(n + 1, dtype=np.int64)
-    for f in range(len(faces)):
-        for k in range(3):
-            start[faces[f, k] + 1] += 2
-    for v in range(n):
-        start[v + 1] += start[v]
-    end, beside, mark = np.empty(n, dtype=np.int64), np.empty(start[n], dtype=np.int64), _none(n)
-    for v in range(n):
-        end[v] = start[v]
-    for f in range(len(faces)):
-        for k in range(3):
-            v = faces[f, k]
-            beside[end[v]], beside[end[v] + 1] = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
-            end[v] += 2
+def _each_once(start: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Keep each neighbour of a vertex once, in the first of its places; where they end, (N,)."""
+    n = len(start) - 1
+    end, mark = np.empty(n, dtype=np.int64), _none(n)
     for v in range(n):
         end[v] = start[v]
         for q in range(start[v], start[v + 1]):
@@ -334,7 +324,7 @@ def _neighbours(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.n
             if mark[w] != v:
                 mark[w], beside[end[v]] = v, w
                 end[v] += 1
-    return start, end, beside
+    return end
 
 
 @compiled

@@ -135,6 +135,19 @@ def _entries(metric: np.ndarray) -> tuple[float, float, float]:
 
 
 @compiled
+def _held(
+    source: np.ndarray, target: np.ndarray, floor: float, eps: float
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Of A and B (2, 2): A's entries with its floor, its determinant, the least that this is held
+    above, and B's entries."""
+    a, b, c = _entries(source)
+    e, f, g = _entries(target)
+    a, c = a + floor, c + floor
+    least = eps * max(a + c, 2 * floor) ** 2
+    return a, b, c, a * c - b * b, least, e, f, g
+
+
+@compiled
 def _invariants(
     source: np.ndarray,
     target: np.ndarray,
@@ -145,11 +158,7 @@ def _invariants(
 ) -> None:
     """Metrics (N, 2, 2) to traces and determinants (N,)."""
     for p in range(len(source)):
-        a, b, c = _entries(source[p])
-        e, f, g = _entries(target[p])
-        a, c = a + floor, c + floor
-        least = eps * max(a + c, 2 * floor) ** 2
-        det = a * c - b * b
+        a, b, c, det, least, e, f, g = _held(source[p], target[p], floor, eps)
         det = least if det < least else det
         t, d = (c * e - 2 * b * f + a * g) / det, (e * g - f * f) / det
         t, d = 0.0 if t < 0 else t, 0.0 if d < 0 else d
@@ -170,12 +179,7 @@ def _invariants_backward(
 ) -> None:
     """Gradients (N, 2, 2) by the metrics of one by traces and determinants (N,)."""
     for p in range(len(source)):
-        a, b, c = _entries(source[p])
-        e, f, g = _entries(target[p])
-        a, c = a + floor, c + floor
-        width = max(a + c, 2 * floor)
-        least = eps * width * width
-        own = a * c - b * b
+        a, b, c, own, least, e, f, g = _held(source[p], target[p], floor, eps)
         det = least if own < least else own
         t, d = (c * e - 2 * b * f + a * g) / det, (e * g - f * f) / det
         # d is held at t²/4; where both are equal, each has half of the gradient
@@ -187,7 +191,7 @@ def _invariants_backward(
         by_det = -(by_t * t + by_d * d)
         of_det, of_width = by_det, 0.0
         if own < least:
-            of_det, of_width = 0.0, by_det * 2 * eps * width if a + c >= 2 * floor else 0.0
+            of_det, of_width = 0.0, by_det * 2 * eps * (a + c) if a + c >= 2 * floor else 0.0
         _put(
             by_a[p],
             by_t * g + of_det * c + of_width,

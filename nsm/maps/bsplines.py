@@ -19,7 +19,18 @@ from nsm.maps import compiled_bsplines as loops
 from nsm.maps.compiled_bsplines import CLAMPED, EVEN, ODD, PERIODIC
 from nsm.tensors import suit_compiled
 
-__all__ = ["CLAMPED", "EVEN", "ODD", "PERIODIC", "Grid", "read", "read_plainly", "seen"]
+__all__ = [
+    "CLAMPED",
+    "EVEN",
+    "ODD",
+    "PERIODIC",
+    "Grid",
+    "into_domain",
+    "read",
+    "read_plainly",
+    "rows_of",
+    "seen",
+]
 
 
 class Grid(NamedTuple):

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from nsm.domains.coarse_to_fine import mean_value_weights
-from nsm.domains.decimation import Round, coarsen, undo
+from nsm.domains.decimation import Round, coarsen, has_area, undo
 from nsm.domains.kernels import innermost
 from nsm.domains.orbifold import group
 from nsm.domains.orbifold.collapses import collapsed
@@ -82,7 +82,7 @@ class Level:
     def __init__(
         self, vertices: np.ndarray, faces: np.ndarray, step: Round | None, area: float
     ) -> None:
-        self.alive = _alive(faces)
+        self.alive = np.flatnonzero(has_area(faces))
         self._faces, self._vertices = faces[self.alive], vertices
         self._scale = area / topology.face_areas(vertices, self._faces).sum()
         self.stars: Stars | None = None
@@ -165,7 +165,7 @@ def hierarchy(
     start, first = begun or (faces, [])
     current, rounds = coarsen(vertices, start, held, effort.coarse)
     rounds = first + rounds
-    alive = _alive(current)
+    alive = np.flatnonzero(has_area(current))
     ids, local = topology.renumbered(current[alive], len(vertices))
     few, last_rounds = collapsed(vertices[ids], local[current[alive]], held[ids], effort.coarsest)
     return Hierarchy(
@@ -203,7 +203,7 @@ def laid_out(
     area = AREA[cones is not None]
     levels = levels or hierarchy(vertices, faces, held, effort, area, begun)
     ids, rounds = levels.ids, levels.first.rounds
-    alive = _alive(levels.first.faces)
+    alive = np.flatnonzero(has_area(levels.first.faces))
     local = np.full(len(vertices), -1)
     local[ids] = np.arange(len(ids))
     lift = regauged(faces, lift, rounds + [_renamed(r, ids, alive) for r in levels.second.rounds])
@@ -293,19 +293,9 @@ def relax_all(
         before = energy
 
 
-def _alive(faces: np.ndarray) -> np.ndarray:
-    a, b, c = faces.T
-    return np.flatnonzero((a != b) & (b != c) & (c != a))
-
-
-def scaled(vertices: np.ndarray, faces: np.ndarray, area: float) -> np.ndarray:
-    """The vertices (V, 3) in a unit in which the faces have the given area."""
-    return vertices * np.sqrt(area / topology.face_areas(vertices, faces).sum())
-
-
 def _first(levels: Levels, layout: Layout, cones: np.ndarray | None, weights: str) -> None:
     """Tutte's embedding of the coarsest mesh."""
-    alive = _alive(levels.faces)
+    alive = np.flatnonzero(has_area(levels.faces))
     present = levels.faces[alive]
     weight = edge_weights(levels.vertices, present, weights)
     x, quadratic = tutte(present, layout.lift[alive], weight, cones)

@@ -15,7 +15,7 @@ from nsm.domains.orbifold.certificate import certificate, torn_edges
 from nsm.domains.orbifold.collapses import collapsed
 from nsm.domains.orbifold.cones import compared
 from nsm.domains.orbifold.lifts import cone_lifts
-from nsm.domains.orbifold.multiresolution import Effort, laid_out, scaled
+from nsm.domains.orbifold.multiresolution import Effort, laid_out
 from nsm.domains.orbifold.newton import Quotient, distortions
 from nsm.domains.orbifold.stars import seen
 from nsm.domains.orbifold.sweeps import relax
@@ -33,7 +33,7 @@ def _problem(seed: int = 1, count: int = 25):  # type: ignore[no-untyped-def]
     lattice = best_lattice(quadratic, 4.0)
     held = np.zeros(len(vertices), dtype=bool)
     held[cones] = True
-    mesh = scaled(vertices, faces, 2.0)
+    mesh = vertices * np.sqrt(2.0 / topology.face_areas(vertices, faces).sum())
     return mesh, faces, lift, cones, held, x, lattice
 
 
