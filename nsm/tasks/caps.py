@@ -48,8 +48,8 @@ class Caps(nn.Module):
         """
         some = self.quadrature.take()
         image = h(some.uv)
-        B = first_fundamental_form(some.sides(psi(image)))
-        relative = some.relative(some.sides(image))
+        B = some.forms(psi(image))
+        relative = some.relative(image)
         values = energy.total(energy.parts(some.metric, B, some.at))
         folds = self.folds(relative, step)
         share = some.share

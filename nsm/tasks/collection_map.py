@@ -174,14 +174,14 @@ class CollectionMap(ConstrainedMap):
         some, phi = turn.some, self.phis[turn.number]
         image = self.map[turn.number](some.uv)
         position, centres = phi(image), some.centres_on(image)[None]
-        metric = first_fundamental_form(some.sides(position))
+        metric = some.forms(position)
         parts = self.energy.parts(*turn.ends(metric), turn.at)
         evaluation = Evaluation(
             centres,
             some.centres_on(position)[None],
             centres,
             source=metric[None],
-            determinant=some.relative(some.sides(image))[None],
+            determinant=some.relative(image)[None],
             share=some.oriented[None],
         )
         return Distortion(self.energy, parts, turn.share), evaluation
@@ -270,7 +270,7 @@ class CollectionMap(ConstrainedMap):
         with torch.no_grad():
             image, jacobian = h.value_and_jacobian(x)  # type: ignore[operator]
             outer = phi.value_and_jacobian(image)[1].double()  # type: ignore[operator]
-            relative = some.relative(some.sides(h(some.uv)))
+            relative = some.relative(h(some.uv))
             excess = (relative - determinant(jacobian)).double()
         share = pairs * turn.share.double() / turn.share.sum()
         folding = scale * self.loss_weights.injectivity * some.oriented.double()

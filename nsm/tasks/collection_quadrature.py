@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import At, first_fundamental_form
+from nsm.energies import At
 from nsm.maps.inverse import Inverse
 from nsm.tasks.mesh_quadrature import MOST, MeshQuadrature, Triangles, triangles
 
@@ -123,9 +123,9 @@ class CollectionQuadrature(nn.Module):
         inward, outward = (owner != number).nonzero()[:, 0], (owner == number).nonzero()[:, 0]
         others = [j for j in range(len(parts)) if j != number]
         own, x = parts[number], corners[number].nan_to_num()
-        images = [own.sides(each[j].surface(maps[j](x))) for j in others]
+        images = [own.forms(each[j].surface(maps[j](x))) for j in others]
         of = torch.cat([inward, *[outward] * len(others)])
-        held = [some.metric[inward], *(first_fundamental_form(sides) for sides in images)]
+        held = [some.metric[inward], *images]
         centres = torch.cat([part.centres for part in parts])
         on_surfaces = torch.cat([part.positions for part in parts])
         at = At(centres[of], on_surfaces[of])

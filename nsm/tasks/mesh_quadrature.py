@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsm.energies import At, first_fundamental_form
+from nsm.energies import At
 from nsm.energies.metrics import determinant
+from nsm.tasks.triangle_quantities import centres, determinants, forms, sides
 
 _AT_ONCE = 8192
 MOST = 65_536  # triangles of a mesh that are all taken
@@ -41,37 +42,25 @@ class Triangles:
     oriented: Tensor
 
     @cached_property
-    def _corners(self) -> Tensor:
-        """(3F,) in ``uv``: all first corners, all second, all third."""
-        return self.faces.t().flatten()
-
-    @cached_property
     def _own(self) -> tuple[Tensor, Tensor]:
         """(F,) whether single precision tells an orientation; the determinants where it does."""
         told = self.oriented > 0
         return told, torch.where(told, self.determinant, 1.0)
 
-    def corners_on(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The three corners, (F, n) each, of the triangles with images (V, n) of the corners."""
-        # not by image[faces], whose backward pass sorts
-        a, b, c = image.index_select(0, self._corners).view(3, -1, image.shape[1]).unbind()
-        return a, b, c
+    def forms(self, image: Tensor) -> Tensor:
+        """First fundamental forms (F, 2, 2), in the frames of the triangles' first two sides, of
+        the map that is linear on them with images (V, n) of the corners."""
+        return forms(image, self.faces)
 
-    def sides(self, image: Tensor) -> Tensor:
-        """The first two sides (F, n, 2) of the triangles with images (V, n) of the corners."""
-        a, b, c = self.corners_on(image)
-        return torch.stack([b - a, c - a], dim=-1)
-
-    def relative(self, sides: Tensor) -> Tensor:
-        """Determinants (F,) of sides (F, 2, 2) that a planar map makes of the triangles' own, in
-        units of these; 1 where single precision does not tell."""
+    def relative(self, image: Tensor) -> Tensor:
+        """Signed areas (F,) of the triangles with images (V, 2) of the corners, in units of their
+        own; 1 where single precision does not tell."""
         told, own = self._own
-        return torch.where(told, determinant(sides) / own, 1.0)
+        return torch.where(told, determinants(image, self.faces) / own, 1.0)
 
     def centres_on(self, image: Tensor) -> Tensor:
         """The centres (F, n) of the triangles with images (V, n) of the corners."""
-        a, b, c = self.corners_on(image)
-        return (a + b + c) / 3
+        return centres(image, self.faces)
 
     @cached_property
     def centres(self) -> Tensor:
@@ -143,12 +132,11 @@ class MeshQuadrature(nn.Module):
 
 def triangles(uv: Tensor, faces: Tensor, points: Tensor) -> Triangles:
     """Those with corners uv (V, 2) in Ω and points (V, 3) of the surface, faces (F, 3)."""
-    some = Triangles(uv, faces, points, uv, uv, uv, uv)
-    metric = first_fundamental_form(some.sides(points))
+    metric = forms(points, faces)
     area = determinant(metric.double()).clamp(min=0).sqrt()
     share = (area / area.sum()).to(metric.dtype)
-    sides = some.sides(uv)
-    signed = determinant(sides)
-    longest = torch.cat([sides, sides[..., :1] - sides[..., 1:]], dim=-1).norm(dim=1).amax(dim=1)
+    two = sides(uv, faces)
+    longest = torch.cat([two, two[..., :1] - two[..., 1:]], dim=-1).norm(dim=1).amax(dim=1)
+    signed = determinants(uv, faces)
     oriented = torch.where(signed > _THIN * longest, share, 0.0)
-    return replace(some, metric=metric, share=share, determinant=signed, oriented=oriented)
+    return Triangles(uv, faces, points, metric, share, signed, oriented)

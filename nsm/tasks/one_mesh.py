@@ -80,7 +80,7 @@ class OneMeshMap(AtTriangles):
             one = batch.uv.new_ones(len(batch.uv))
             return Places(batch.uv, At(batch.uv, batch.points), one / len(one), one, None)
         with torch.no_grad():
-            relative = some.relative(some.sides(self.map(some.uv)))
+            relative = some.relative(self.map(some.uv))
         told = some.oriented / some.share.clamp(min=1e-30)
         return Places(some.centres, some.at, some.share, told, relative)
 
@@ -124,18 +124,17 @@ class OneMeshMap(AtTriangles):
         return folds
 
     def _on_triangles(
-        self, some: Triangles, h: Tensor, sides: Tensor, image_metric: Tensor
+        self, some: Triangles, h: Tensor, image_metric: Tensor
     ) -> tuple[Distortion, Evaluation]:
         """The energy of the map that is linear on triangles, and what it is made from.
 
         Args:
             some: the triangles.
             h: (V, 2) of their corners.
-            sides: (F, 2, 2) of the triangles that h makes of them.
             image_metric: B (F, 2, 2), in the frames of their first two sides.
         """
         parts = self.energy.parts(some.metric, image_metric, some.at)
-        det = some.relative(sides)
+        det = some.relative(h)
         evaluation = Evaluation(
             some.centres,
             some.positions,

@@ -133,8 +133,7 @@ class PairMap(ConstrainedMap, OneMeshMap):
         """The energy at samples of the source, and what it is made from."""
         if self.training and (some := self.triangles(len(batch.uv))) is not None:
             h = self.map(some.uv)
-            B = first_fundamental_form(some.sides(self.psi(h)))
-            return self._on_triangles(some, h, some.sides(h), B)
+            return self._on_triangles(some, h, some.forms(self.psi(h)))
         A, B, jacobian, h = self.pointwise(self._at, batch.uv)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
         if not self.exact:  # samples that h maps out of Ω do not count

@@ -111,8 +111,7 @@ class Param(OneMeshMap):
         """The energy at samples, and what it is made from; φ's part is not recorded."""
         if self.training and (some := self.triangles(len(batch.uv))) is not None:
             h = self.map(some.uv)
-            sides = some.sides(h)
-            return self._on_triangles(some, h, sides, first_fundamental_form(sides))
+            return self._on_triangles(some, h, some.forms(h))
         A, jacobian, h = self.pointwise(self._at, batch.uv)
         B = first_fundamental_form(jacobian)
         parts = self.energy.parts(A, B, At(batch.uv, batch.points))
