@@ -6,7 +6,7 @@ exchanged, or with the orientation turned around tells by its energy which chang
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal, NamedTuple
@@ -29,6 +29,7 @@ _STRAINED = 10.0  # energy of a strained map: then more is left out
 _ASTRAY = 12.0  # energy from which on a map may be of a wrong isotopy class: other cones are tried
 _GOOD = 7.0  # energy below which the map needs no change, whatever distances between landmarks say
 _SETS = 12  # sets of four at the cones that are tried, until a map is good
+_TOGETHER = 4  # sets that are tried at once
 _BETTER = 0.8  # share of the energy with the first set, from which on another one is taken
 # energies from which on landmarks are doubted as a whole; few are on like shapes met with less
 _FEW, _STRAINED_FEW, _STRAINED_MANY = 5, 16.0, 30.0
@@ -194,10 +195,12 @@ class _Maps:
         """The four landmarks (4,) for the cones with which the map through all of them is much less
         distorted than with the first set; None if there are none."""
         best, found = _BETTER * energy, None
-        for four in counted("other cones", list(self.sets[1:_SETS])):
-            energies = self._energies(four, [self._through_all])
-            if energies is not None and energies[0] < best:
-                best, found = energies[0], four
+        for k in counted("other cones", range(1, _SETS, _TOGETHER)):
+            sets = list(self.sets[k : min(k + _TOGETHER, _SETS)])
+            every = self._all_energies([(four, [self._through_all]) for four in sets])
+            for four, energies in zip(sets, every, strict=True):
+                if energies is not None and energies[0] < best:
+                    best, found = energies[0], four
             if best < _GOOD:
                 break
         return found
@@ -248,26 +251,35 @@ class _Maps:
 
     def _energies(self, four: np.ndarray, trials: list[_Trial]) -> list[float] | None:
         """The least energies of trials over isotopy classes, with cones at four landmarks."""
-        layouts = self._layouts(four)
-        if layouts is None:
-            return None
-        a, b, looked_up = layouts
-        ways = {det: _starts(a, b, looked_up, det) for det in (1, -1)}
+        return self._all_energies([(four, trials)])[0]
+
+    def _all_energies(
+        self, wanted: Sequence[tuple[np.ndarray, list[_Trial]]]
+    ) -> list[list[float] | None]:
+        """The same for several fours, each with its trials: None where there is no layout."""
         number, found, drawn = [], [], []
-        for k, trial in enumerate(trials):
-            mirrored = trial.change is not None and trial.change[0] == "mirrored"
-            pairs = np.stack([self.source.tips, self.target.tips[trial.order]], axis=1)
-            wanted = np.stack([four, trial.order[four]], axis=1)
-            for candidate in ways[-1 if mirrored else 1]:
-                if np.array_equal(candidate.cone_numbers(), wanted):
-                    number.append(k)
-                    found.append(candidate)
-                    drawn.append(pairs[trial.kept])
-        best = [np.inf] * len(trials)
+        best: list[list[float] | None] = []
+        for n, (four, trials) in enumerate(wanted):
+            layouts = self._layouts(four)
+            best.append(None if layouts is None else [np.inf] * len(trials))
+            if layouts is None:
+                continue
+            ways = {det: _starts(*layouts, det) for det in (1, -1)}
+            for k, trial in enumerate(trials):
+                mirrored = trial.change is not None and trial.change[0] == "mirrored"
+                pairs = np.stack([self.source.tips, self.target.tips[trial.order]], axis=1)
+                cones = np.stack([four, trial.order[four]], axis=1)
+                for candidate in ways[-1 if mirrored else 1]:
+                    if np.array_equal(candidate.cone_numbers(), cones):
+                        number.append((n, k))
+                        found.append(candidate)
+                        drawn.append(pairs[trial.kept])
         with part(number_of(len(found), "map")):
             after = trained(found, _ROUND, drawn=drawn)
-        for k, candidate in zip(number, after, strict=True):
-            best[k] = min(best[k], candidate.energy)
+        for (n, k), candidate in zip(number, after, strict=True):
+            of_four = best[n]
+            assert of_four is not None
+            of_four[k] = min(of_four[k], candidate.energy)
         return best
 
     def _layouts(self, four: np.ndarray) -> tuple[Layout, Layout, Table] | None:

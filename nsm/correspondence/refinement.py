@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nsm.correspondence.compiled_energies import Energies
 from nsm.correspondence.layouts import Layout, Table
+from nsm.tensors import suit_compiled
 
 _EPSILON = 0.01  # of the symmetric Dirichlet energy
 _CAPPED = 50.0  # energies above it count by their logarithm
@@ -67,10 +70,11 @@ class Anchors(NamedTuple):
 
 
 class Batch:
-    """Maps h of one source's layout to targets, x ↦ B (x + n(x)) + c, and their energies.
+    """Maps h of layouts of one shape to targets, x ↦ B (x + n(x)) + c, and their energies.
 
     Args:
-        source: the layout.
+        sources: the layouts.
+        count: (S,) how many maps each has; those of the first one come first.
         tables: of the targets.
         number: (H,) of each map's target among the tables.
         matrices: B (H, 2, 2).
@@ -81,7 +85,8 @@ class Batch:
 
     def __init__(
         self,
-        source: Layout,
+        sources: Sequence[Layout],
+        count: Sequence[int],
         tables: list[Table],
         number: np.ndarray,
         matrices: np.ndarray,
@@ -90,22 +95,28 @@ class Batch:
         anchors: Anchors | None = None,
     ) -> None:
         def tensor(array: np.ndarray) -> Tensor:
-            return torch.as_tensor(array, dtype=torch.float32)
+            return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
 
         # derivatives along an orthonormal frame of each triangle, the columns of L in G⁻¹ = L Lᵀ
-        frame = np.linalg.cholesky(source.inverse)
-        value, *along = Sines.up_to(largest).basis(source.at)
-        along = np.einsum("nij,ink->jnk", frame, np.stack(along))
-        self.basis = tensor(np.concatenate([value, *along]).T)  # (K, 3N)
-        at = np.einsum("hij,nj->ihn", matrices, source.at) + shifts.T[:, :, None]
-        affine = np.einsum("hij,njk->ihkn", matrices, frame)
-        self.affine = tensor(np.concatenate([at[:, :, None], affine], axis=2))  # (2, H, 3, N)
-        scale = np.linalg.det(frame)
-        self.scale = tensor(scale)
+        frames = [np.linalg.cholesky(source.inverse) for source in sources]
+        self.count = list(count)
+        self.bases, affine = [], []  # (K, 3N), (2, H', 3, N)
+        of_source = np.split(np.arange(len(matrices)), np.cumsum(count)[:-1])
+        for source, frame, own in zip(sources, frames, of_source, strict=True):
+            value, *along = Sines.up_to(largest).basis(source.at)
+            along = np.einsum("nij,ink->jnk", frame, np.stack(along))
+            self.bases.append(tensor(np.concatenate([value, *along]).T))
+            at = np.einsum("hij,nj->ihn", matrices[own], source.at) + shifts[own].T[:, :, None]
+            turned = np.einsum("hij,njk->ihkn", matrices[own], frame)
+            affine.append(np.concatenate([at[:, :, None], turned], axis=2))
+        self.affine = tensor(np.concatenate(affine, axis=1))  # (2, H, 3, N)
+        scale = np.repeat(np.linalg.det(np.stack(frames)), count, axis=0)
+        self.scale = tensor(scale)  # (H, N)
         self.inverse_scale = tensor(np.linalg.det(matrices)[:, None] / scale)
-        self.area = tensor(source.area)
+        self.area = tensor(sources[0].area)
         self.cells, self.number = len(tables[0].log_metric), torch.as_tensor(number)
         self.bilinear = tensor(np.concatenate([_bilinear(t.log_metric) for t in tables]))
+        self.by_cell = self.bilinear.view(len(tables), self.cells, self.cells, 4, 3)
         self.matrices, self.shifts = tensor(matrices), tensor(shifts)
         self.anchors = anchors
         if anchors is not None:
@@ -132,10 +143,20 @@ class Batch:
 
     def energies(self, amplitudes: Tensor) -> Tensor:
         """Mean symmetric Dirichlet energy (H,) of maps with amplitudes (H, K, 2)."""
-        # by coordinates: products of small matrices, one by one, would take most of the time
-        maps, waves, _ = amplitudes.shape
-        moved = (amplitudes @ self.matrices.mT).permute(2, 0, 1).reshape(2 * maps, waves)
-        h = self.affine + (moved @ self.basis[:waves]).view(2, maps, 3, -1)
+        moved = (amplitudes @ self.matrices.mT).permute(2, 0, 1)
+        waves = moved.split(self.count, dim=1)
+        each = [w @ basis[: w.shape[2]] for w, basis in zip(waves, self.bases, strict=True)]
+        h = self.affine + torch.cat(each, dim=1).view(self.affine.shape)
+        if not suit_compiled(h):
+            return self._plain_energies(h)
+        limits = _EPSILON, _LEAST_DETERMINANT, _CAPPED
+        found: Tensor = Energies.apply(
+            h, self.number, self.by_cell, self.inverse_scale, self.scale, self.area, limits
+        )
+        return found
+
+    def _plain_energies(self, h: Tensor) -> Tensor:
+        """The same (H,) from values and derivatives (2, H, 3, N), by operations on tensors."""
         (x, a, b), (y, c, d) = (one.unbind(dim=1) for one in h)
         m, p, q = self._log_metrics(x, y)
         size, even, odd = _exponential(m, p, q)

@@ -286,7 +286,7 @@ def trained(
     held: bool = False,
     drawn: Sequence[np.ndarray] | None = None,
 ) -> list[Candidate]:
-    """The candidates after a round of trainings; those of one source's layout in one batch.
+    """The candidates after a round of trainings; those of one source in one batch.
 
     Args:
         found: the candidates.
@@ -296,16 +296,19 @@ def trained(
             another with more force; none by default.
     """
     waves = len(Sines.up_to(one.largest).waves)
-    by_source: dict[int, list[int]] = {}
+    by_layout: dict[int, dict[int, list[int]]] = {}
     for k, candidate in enumerate(found):
-        by_source.setdefault(id(candidate.source), []).append(k)
+        of_shape = by_layout.setdefault(id(candidate.source.shape), {})
+        of_shape.setdefault(id(candidate.source), []).append(k)
     result = list(found)
-    for members in by_source.values():
+    for layouts in by_layout.values():
+        members = [k for of_layout in layouts.values() for k in of_layout]
         group_ = [found[k] for k in members]
         tables = list({id(c.table): c.table for c in group_}.values())
         number = {id(t): k for k, t in enumerate(tables)}
         batch = Batch(
-            group_[0].source,
+            [found[of_layout[0]].source for of_layout in layouts.values()],
+            [len(of_layout) for of_layout in layouts.values()],
             tables,
             np.array([number[id(c.table)] for c in group_]),
             np.stack([c.matrix for c in group_]),

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from thorough import examples
 
+from nsm.correspondence import refinement
+from nsm.correspondence.compiled_energies import Energies
 from nsm.correspondence.layouts import _logarithm
 from nsm.correspondence.refinement import (
     Anchors,
@@ -29,7 +31,8 @@ def flat(tables, matrices, shifts, largest=2, metric=None, **more):
     inverse = np.tile(np.eye(2) if metric is None else np.linalg.inv(metric), (count, 1, 1))
     source = SimpleNamespace(at=POINTS, inverse=inverse, area=np.full(count, 1 / count))
     return Batch(
-        source,
+        [source],
+        [len(matrices)],
         [SimpleNamespace(log_metric=t) for t in tables],
         np.arange(len(matrices)) % len(tables),
         np.array(matrices),
@@ -118,6 +121,73 @@ def test_the_energy_of_a_map_that_is_not_affine():
         energy += symmetric_dirichlet(root @ jacobian) / len(POINTS)
     found = batch.energies(torch.as_tensor(amplitudes[None], dtype=torch.float32)).item()
     assert found == pytest.approx(energy, rel=1e-3)
+
+
+def varied(*, targets=2, maps=4, scale=0.3):
+    """A batch of maps to rough targets, some of them folded, and amplitudes (H, 12, 2)."""
+    rng = np.random.default_rng(1)
+    tables = [0.3 * rng.normal(size=(8, 8, 3)) for _ in range(targets)]
+    matrices = [((1, 0), (0, 1)), ((1, 1), (0, 1)), ((0, -1), (1, 0)), ((1, 0), (1, 1))][:maps]
+    batch = flat(tables, matrices, [(k, 1) for k in range(maps)])
+    return batch, torch.as_tensor(scale * rng.normal(size=(maps, 12, 2))).float()
+
+
+@pytest.mark.parametrize("scale", [0.02, 0.3])
+def test_compiled_energies_are_as_plain(scale, monkeypatch):
+    batch, amplitudes = varied(scale=scale)
+    found = []
+    for compiled in (True, False):
+        if not compiled:
+            monkeypatch.setattr(refinement, "suit_compiled", lambda *_: False)
+        x = amplitudes.clone().requires_grad_()
+        energies = batch.energies(x)
+        (energies * torch.arange(1.0, 5.0)).sum().backward()
+        found.append((energies.detach(), x.grad))
+    for one, other in zip(*found, strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-4 * float(other.abs().max()))
+
+
+def test_gradients_of_compiled_energies_are_finite_differences():
+    """In double precision, which the loops take too; some triangles are folded, some far above
+    the energy that counts in full."""
+    rng = np.random.default_rng(2)
+    h = torch.as_tensor(np.stack([rng.normal(size=(2, 3, 9)), rng.normal(size=(2, 3, 9))]))
+    number, bilinear = torch.tensor([0, 1]), torch.as_tensor(0.3 * rng.normal(size=(2, 4, 4, 4, 3)))
+    scale, area = torch.as_tensor(rng.uniform(0.5, 2, (2, 9))), torch.as_tensor(rng.uniform(size=9))
+    limits = 0.01, 0.1, 50.0
+
+    def energies(x):
+        return Energies.apply(x, number, bilinear, 1 / scale, scale, area, limits)
+
+    folded = h[0, :, 1] * h[1, :, 2] - h[0, :, 2] * h[1, :, 1] < 0
+    assert folded.any() and not folded.all()
+    assert torch.autograd.gradcheck(energies, h.requires_grad_(), eps=1e-7, rtol=1e-4)
+
+
+def test_layouts_of_one_shape_in_one_batch_are_as_one_by_one():
+    one, amplitudes = varied()
+    first = SimpleNamespace(at=POINTS, inverse=np.tile(np.eye(2), (len(POINTS), 1, 1)), area=None)
+    first.area = np.full(len(POINTS), 1 / len(POINTS))
+    second = SimpleNamespace(at=POINTS[::-1], inverse=2 * first.inverse, area=first.area)
+    tables = [SimpleNamespace(log_metric=one.by_cell[k, :, :, 0].numpy()) for k in range(2)]
+    matrix, shift, number = np.eye(2)[None], np.zeros((1, 2)), np.zeros(1, dtype=int)
+    both = Batch(
+        [first, second],
+        [1, 2],
+        tables,
+        np.array([0, 1, 0]),
+        np.repeat(matrix, 3, axis=0),
+        np.repeat(shift, 3, axis=0),
+        2,
+    )
+    alone = [
+        Batch([source], [1], [tables[k]], number, matrix, shift, 2)
+        for source, k in ((first, 0), (second, 1), (second, 0))
+    ]
+    x = 0.1 * amplitudes[:3]
+    expected = [b.energies(x[k : k + 1])[0] for k, b in enumerate(alone)]
+    assert torch.allclose(both.energies(x), torch.stack(expected), rtol=1e-5)
+    assert len({round(float(e), 3) for e in expected}) == 3
 
 
 def test_training_finds_the_isometry():
