@@ -1,4 +1,5 @@
-"""Where the wait goes: CPU seconds of each stage, from raw files to the last file written.
+"""Where the wait goes: CPU seconds of each stage, from raw files to the last file written, and the
+most memory on the way.
 
 Each case is a process of its own with an empty cache and one thread. A stage's seconds are its own:
 those of a stage within it are left out. Seconds of the processes that a run starts count too.
@@ -14,6 +15,7 @@ import inspect
 import json
 import os
 import platform
+import resource
 import subprocess
 import sys
 import tempfile
@@ -29,6 +31,7 @@ LARGER = "shrec07-393"  # of 9,757 vertices
 CASES = {
     "pair_map": "a pair map",
     "fast": "a pair map, experiment=fast",
+    "adam": "a pair map, experiment=adam",
     "disc": "a pair map on the disc",
     "overfit": "a neural surface",
     "fit": "a neural surface, experiment=fit",
@@ -77,6 +80,12 @@ def seconds() -> float:
     """CPU seconds of this process and of those that it started and that have ended."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+def peak() -> float:
+    """The most memory of this process so far, in MiB."""
+    kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return kilobytes / 1024 if sys.platform != "darwin" else kilobytes / 1024**2
 
 
 class Clock:
@@ -131,7 +140,9 @@ def overrides_of(case: str, meshes: Path) -> list[str]:
         domain = [] if case == "overfit" else ["domain=disc"]
         return [f"task={case}", f"surface.path={first}", *domain]
     marks = [str(meshes / "landmarks" / f"{name}.vts") for name in PAIR]
-    extra = {"fast": ["experiment=fast"], "disc": ["domain=disc"]}.get(case, [])
+    extra = {"disc": ["domain=disc"]}.get(case, [])
+    if case in ("fast", "adam"):
+        extra = [f"experiment={case}"]
     return [
         "task=pair_map",
         f"source={first}",
@@ -177,6 +188,7 @@ def run(case: str, meshes: Path, extra: list[str]) -> dict[str, Any]:
         "stages": spent,
         "cpu_seconds": round(sum(spent.values()), 2),
         "wall_seconds": round(time.perf_counter() - begun, 1),
+        "peak_mib": round(peak()),
         "figures": {key: round(float(figures[key]), 5) for key in kept if key in figures},
     }
 
@@ -222,6 +234,8 @@ def section(results: dict[str, Any]) -> list[str]:
     before = (of["cpu_seconds"] - of["stages"].get(AFTER, 0.0) for of in cases.values())
     shown = " | ".join(f"{s:.1f}" for s in before)
     lines.append(f"| until the figures are printed | {shown} |")
+    peaks = ("–" if "peak_mib" not in of else str(of["peak_mib"]) for of in cases.values())
+    lines.append("| most memory, MiB | " + " | ".join(peaks) + " |")
     for key, label in FIGURES.items():
         told = [of["figures"].get(key) for of in cases.values()]
         cells = ("–" if value is None else f"{value:.3f}" for value in told)
