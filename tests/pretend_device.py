@@ -25,6 +25,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
+from nsm.tensors import transformed
+
 NAME = "meta"
 _COPIES = ("_to_copy", "copy_")
 _INDEXING = ("index", "index_put", "index_put_", "_index_put_impl_")
@@ -53,6 +55,10 @@ class OnDevice(Tensor):
         )
         made.held = held
         return made
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """As it is read where the device is not: a checkpoint's tensors are mapped to the CPU."""
+        return self.held.__reduce_ex__(protocol)
 
     def __repr__(self, *, tensor_contents: Any = None) -> str:
         return f"OnDevice({self.held})"
@@ -90,6 +96,8 @@ class _Operations(TorchDispatchMode):
         self.counts = counts
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if transformed():  # torch would end the process
+            raise NotImplementedError(f"{func}: the pretend device knows no torch.func")
         kwargs = dict(kwargs or {})
         given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
         own = [x for x in given if isinstance(x, OnDevice)]
