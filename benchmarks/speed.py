@@ -512,6 +512,32 @@ def _named(key: str) -> str:
     return f"{task}, {'experiment=adam' if network else settings}"
 
 
+_ON_A_GPU = [
+    "No GPU was there. Nothing of nsm has run on CUDA, and no figure of these pages is of a GPU; "
+    "`make bench-speed` measures there what this page has, and writes "
+    "`benchmarks/results/speed-NAME.json`. Instead, tests train on a pretended accelerator "
+    "(`tests/pretend_device.py`). Its tensors hold numbers, but no operation takes them together "
+    "with those of the CPU, numpy cannot read them, and copies are counted. So it is known that:",
+    "",
+    "- Steps of all tasks, by default and with the paper's settings, and a whole run of a "
+    "collection end there as on the CPU, up to rounding.",
+    "- A step of Adam of a map copies nothing between host and device. Lightning's hooks add one "
+    "number: whether loss and gradient are finite.",
+    "- A quasi-Newton step keeps coefficients, gradients, L-BFGS pairs and the metric on the "
+    "device. The host waits for the loss of each evaluation, that same number, and two numbers in "
+    "each iteration.",
+    "- Splines of a collection are read, and take Adam's steps, in one batch.",
+    "",
+    "The metric is a dense Cholesky factor there: on 128 × 128 cells 16,900 rows, or 8,192 on an "
+    "orbifold, and 2.3 or 0.5 GB for each component of h, two or three. Double precision is slow "
+    "on most consumer cards; there, factors may take longer than the sparse ones on the CPU. "
+    "The host still prepares and certifies, inverts the maps of a collection once in each "
+    "quasi-Newton step, and finds which sides of a free boundary are near in each evaluation. "
+    "Not covered: `trainer.compile` (CUDA graphs), several GPUs, surfaces given by formulas, and "
+    "all that depends on CUDA's own kernels.",
+]
+
+
 def page(results: dict[str, Any]) -> str:
     """The results as the page docs/performance.md."""
     on = results["machine"]
@@ -642,6 +668,7 @@ def page(results: dict[str, Any]) -> str:
             f"{v['evaluations']:.0f} |"
             for task, v in results["loops"].items()
         ]
+    lines += ["", "## On a GPU", "", *_ON_A_GPU]
     if "memory" in results:
         lines += [
             "",

@@ -44,7 +44,7 @@ class QuasiNewton(Optimizer):
 
     A step begins with the matrix K of the loss's curvature (:class:`nsm.tasks.curvature.Curvature`)
     at the present coefficients, each component of a spline apart, with a little H¹ added; its
-    sparse factors are the metric in which L-BFGS begins. K is near enough to the Hessian that few
+    factors, sparse ones on the CPU, are the metric in which L-BFGS begins. K is near enough to the Hessian that few
     iterations follow, and they correct what it leaves out. Backtracking along each direction
     ensures descent.
 
