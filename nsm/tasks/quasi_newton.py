@@ -44,9 +44,9 @@ class QuasiNewton(Optimizer):
 
     A step begins with the matrix K of the loss's curvature (:class:`nsm.tasks.curvature.Curvature`)
     at the present coefficients, each component of a spline apart, with a little H¹ added; its
-    factors, sparse ones on the CPU, are the metric in which L-BFGS begins. K is near enough to the Hessian that few
-    iterations follow, and they correct what it leaves out. Backtracking along each direction
-    ensures descent.
+    factors, sparse ones on the CPU, are the metric in which L-BFGS begins. K is near enough to the
+    Hessian that few iterations follow, and they correct what it leaves out. Backtracking along each
+    direction ensures descent.
 
     A level of n × n cells is a subspace of the finest grid by the two-scale relation of B-splines,
     so a finer level begins with the same function.
@@ -193,7 +193,7 @@ class QuasiNewton(Optimizer):
         ]
         if loss is None or len(gradients) < len(self._moving):
             return None
-        value, parts = self._moving[0][1].vector(torch.as_tensor(loss)), []
+        value, parts = self._moving[0][1].vector(torch.as_tensor(loss, dtype=torch.float64)), []
         for (_, level), g, c in zip(self._moving, gradients, self._split(at), strict=True):
             rough = level.smoothness @ c
             value = value + self.smoothing * (c * rough).sum()
