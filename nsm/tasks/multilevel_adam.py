@@ -55,18 +55,19 @@ class MultilevelAdam:
             of_levels.insert(0, self.two_scale.transposed(of_levels[0]))
         of_levels = [scale * g for scale, g in zip(self.scales, of_levels, strict=True)]
         # one bad sample would be remembered in the moments for long
-        norms = [torch.stack([own.norm() for own in g.chunk(count)]) for g in of_levels]
-        clip = (self.largest / torch.stack(norms).norm(dim=0).clamp(min=1e-30)).clamp(max=1.0)
+        norms = torch.stack([own.norm() for g in of_levels for own in g.chunk(count)])
+        norm = norms.view(-1, count).norm(dim=0)
+        clip = (self.largest / norm.clamp(min=1e-30)).clamp(max=1.0)
         clip = clip[:, None].expand(-1, len(of_levels[0]) // count).reshape(-1, 1, 1)
         total: Tensor | None = None
         for number, (g, scale) in enumerate(zip(of_levels, self.scales, strict=True)):
             key, shape = f"moments_{number}", (len(g) // count, *g.shape[1:])
             moments = _joined([self._moments(state, key, g, shape) for state in states], 1)
-            for state, own in zip(states, moments.split(shape[0], dim=1), strict=True):
-                state[key] = own
-            first, second = moments
-            first.lerp_(clip * g, 1 - self.betas[0])
-            second.lerp_((clip * g).square(), 1 - self.betas[1])
+            for state, part in zip(states, moments.split(shape[0], dim=1), strict=True):
+                state[key] = part
+            first, second, g = *moments, clip * g
+            first.lerp_(g, 1 - self.betas[0])
+            second.lerp_(g.square(), 1 - self.betas[1])
             unbiased = [1 - beta ** (step + 1) for beta in self.betas]
             root = (second / unbiased[1]).sqrt_().add_(self.eps)
             own = first / root * (-lr * scale / unbiased[0])
