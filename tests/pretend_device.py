@@ -96,8 +96,6 @@ class _Operations(TorchDispatchMode):
         self.counts = counts
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if transformed():  # torch would end the process
-            raise NotImplementedError(f"{func}: the pretend device knows no torch.func")
         kwargs = dict(kwargs or {})
         given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
         own = [x for x in given if isinstance(x, OnDevice)]
@@ -156,6 +154,8 @@ class _Numbers(TorchFunctionMode):
     """Tensors from numbers, and numbers from tensors, where torch does not ask the other mode."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if transformed():  # in the other mode, torch would end the process
+            raise NotImplementedError(f"{func}: the pretend device knows no torch.func")
         kwargs = dict(kwargs or {})
         if func is torch.Tensor.tolist and isinstance(args[0], OnDevice):
             return args[0].cpu().tolist()

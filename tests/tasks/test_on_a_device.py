@@ -303,6 +303,11 @@ def test_the_pretend_device_refuses_what_cuda_refuses(what):
             REFUSED[what](x, y)
 
 
+def test_the_pretend_device_has_no_transforms():
+    with pretended(), pytest.raises(NotImplementedError, match="torch.func"):
+        torch.func.jvp(lambda x: x.sin(), (torch.ones(2),), (torch.ones(2),))
+
+
 def test_the_pretend_device_takes_what_cuda_takes_and_counts():
     with pretended() as counts:
         x = torch.arange(6.0, device=NAME).reshape(3, 2)
