@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -93,16 +94,21 @@ def config_of(task: str, settings: str) -> DictConfig:
 def frozen_surface(settings: str, surface: Surface) -> NeuralSurface:
     """An untrained network in place of the neural surface: it costs as much."""
     module = module_of(config_of("overfit", settings), surface)
-    return NeuralSurface(surface, module.map.eval().requires_grad_(False).to(DEVICE))
+    return NeuralSurface(surface, module.map.eval().requires_grad_(False))
+
+
+def ready(data: SurfaceData) -> SurfaceData:
+    """The samples, which are then drawn on the device."""
+    place = SimpleNamespace(root_device=DEVICE)
+    data.trainer = SimpleNamespace(strategy=place, global_rank=0, world_size=1)  # type: ignore[assignment]
+    data.setup()
+    return data
 
 
 def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]:
     """Loss and gradient of one step of the same networks: ours, and the published recipe's."""
     config, surface = config_of(task, settings), dome()
-    data = samples_of(config, surface)
-    data.trainer = None
-    data.setup()
-    batch = Samples(*(part.to(DEVICE) for part in data.batch(0)))
+    batch = ready(samples_of(config, surface)).batch(0)
     phis = [frozen_surface(settings, surface) for _ in range(k)] if task != "overfit" else []
     none = [np.zeros(0, dtype=np.int64)] * k
     module: Any
@@ -134,6 +140,8 @@ def task_steps(task: str, settings: str, k: int = SURFACES) -> tuple[Step, Step]
                 [p.map for p in phis], list(module.map), batch.uv, boundary
             )
 
+    for phi in phis:  # after the preparation, which is the CPU's
+        phi.map.to(DEVICE)
     module.log_every = NEVER  # there is no logger here
     given = batch.uv if task == "collection_map" else batch
 
@@ -242,9 +250,7 @@ def growth(rounds: int) -> dict[str, Any]:
     found = {key: 1e3 * value for key, value in in_turn(sides, rounds).items()}
     for rings in (30, 100, 300, 580):
         surface = dome(rings)
-        data = SurfaceData(surface, batch_size=1024)
-        data.trainer = None
-        data.setup()
+        data = ready(SurfaceData(surface, batch_size=1024))
         uv, faces = torch.as_tensor(surface.uv, dtype=torch.float32), torch.as_tensor(surface.faces)
         barrier, h = FoldBarrier(uv, faces).to(DEVICE), made().to(DEVICE)
         planar = lambda x, h=h: h(x)[:, :2]  # noqa: E731
@@ -303,13 +309,12 @@ def times(mesh: str, limit: float) -> dict[str, Any]:
         config = config_of(name, settings)
         if steps is not None:
             config.trainer.max_steps = steps
+        if phi is not None:
+            phi.map.cpu()  # a map is prepared there
         start = clock()
         module = _stepping(module_of(config, phi or surface).to(DEVICE))
         built = clock() - start
-        data = samples_of(config, surface)
-        data.trainer = None
-        data.setup()
-        return config, module, data, built
+        return config, module, ready(samples_of(config, surface)), built
 
     def rms(module: Any, held: Samples) -> float:
         with torch.no_grad():
@@ -413,10 +418,7 @@ def batches(rounds: int) -> dict[str, Any]:
     """Milliseconds of a step of several surfaces, one after the other and in one batch, and of
     one surface with compiled evaluation."""
     config, surface = config_of("overfit", "default"), dome()
-    data = samples_of(config, surface)
-    data.trainer = None
-    data.setup()
-    batch = data.batch(0)
+    batch = ready(samples_of(config, surface)).batch(0)
     modules = [module_of(config, surface).to(DEVICE) for _ in range(max(BATCHED))]
 
     def step(one: Callable[[Tensor], tuple[Tensor, Tensor]], uv: Tensor) -> Step:
@@ -454,11 +456,86 @@ def batches(rounds: int) -> dict[str, Any]:
     return found
 
 
+def loops(rounds: int) -> dict[str, Any]:
+    """(f) Steps of maps, as they are taken by default."""
+    found = {}
+    for task in ("pair_map", "collection_map"):
+        found[task] = _loop(task, rounds)
+        print(task, found[task], flush=True)
+    return found
+
+
+def _loop(task: str, rounds: int) -> dict[str, float]:
+    """Milliseconds of a step of Adam and of a quasi-Newton step, and how many evaluations of the
+    loss the latter makes."""
+    config, k = compose_config([f"task={task}", "seed=0"]), 2 if task == "pair_map" else SURFACES
+    phis = [frozen_surface("default", dome(height=0.3 + 0.2 * n)) for n in range(k)]
+    none = [np.zeros(0, dtype=np.int64)] * k
+    given: Any = (*phis, none) if task == "pair_map" else (phis, none)
+    module = _stepping(module_of(config, *given).to(DEVICE))
+    module.log_every = NEVER
+    samples = ready(samples_of(config, dome())).batch(0)
+    batch = samples if task == "pair_map" else samples.uv
+    optimizer = module.configure_optimizers()["optimizer"]
+    coefficients = [field.coefficients for field in optimizer.fields]
+    starts = [c.detach().clone() for c in coefficients]
+    count, evaluated = optimizer.state[coefficients[0]], 0
+
+    def closure() -> Tensor:
+        nonlocal evaluated
+        evaluated += 1
+        optimizer.zero_grad()
+        loss: Tensor = module.training_step(batch, 0)
+        loss.backward()
+        return loss
+
+    def at(step: int) -> Step:
+        def run() -> None:
+            with torch.no_grad():
+                for c, start in zip(coefficients, starts, strict=True):
+                    c.copy_(start)
+            module._step = count["step"] = step
+            optimizer.step(closure)
+
+        return run
+
+    last = int(optimizer.newton_from) + 1
+    taken = in_turn({"adam": at(0), "quasi_newton": at(last)}, rounds)
+    found = {f"{name}_milliseconds": 1e3 * v for name, v in taken.items()}
+    return {**found, "evaluations": evaluated / (rounds + 1) - 1}
+
+
 def _named(key: str) -> str:
     """The task and settings of a step, as ``config_of`` takes them."""
     task, settings = key.split("/")
     network = task in _SPLINES and settings == "default"
     return f"{task}, {'experiment=adam' if network else settings}"
+
+
+_ON_A_GPU = [
+    "No GPU was there. Nothing of nsm has run on CUDA, and no figure of these pages is of a GPU; "
+    "`make bench-speed` measures there what this page has, and writes "
+    "`benchmarks/results/speed-NAME.json`. Instead, tests train on a pretended accelerator "
+    "(`tests/pretend_device.py`). Its tensors hold numbers, but no operation takes them together "
+    "with those of the CPU, numpy cannot read them, and copies are counted. So it is known that:",
+    "",
+    "- Steps of all tasks, by default and with the paper's settings, and a whole run of a "
+    "collection end there as on the CPU, up to rounding.",
+    "- A step of Adam of a map copies nothing between host and device. Lightning's hooks add one "
+    "number: whether loss and gradient are finite.",
+    "- A quasi-Newton step keeps coefficients, gradients, L-BFGS pairs and the metric on the "
+    "device. The host waits for the loss of each evaluation, that same number, and two numbers in "
+    "each iteration.",
+    "- Splines of a collection are read, and take Adam's steps, in one batch.",
+    "",
+    "The metric is a dense Cholesky factor there: on 128 × 128 cells 16,900 rows, or 8,192 on an "
+    "orbifold, and 2.3 or 0.5 GB for each component of h, two or three. Double precision is slow "
+    "on most consumer cards; there, factors may take longer than the sparse ones on the CPU. "
+    "The host still prepares and certifies, inverts the maps of a collection once in each "
+    "quasi-Newton step, and finds which sides of a free boundary are near in each evaluation. "
+    "Not covered: `trainer.compile` (CUDA graphs), several GPUs, surfaces given by formulas, and "
+    "all that depends on CUDA's own kernels.",
+]
 
 
 def page(results: dict[str, Any]) -> str:
@@ -574,6 +651,24 @@ def page(results: dict[str, Any]) -> str:
             "With compiled evaluation (`trainer.compile=true`) a step is "
             f"{b['compiled']['ratio']:.2f} times as fast.",
         ]
+    if "loops" in results:
+        lines += [
+            "",
+            "## The steps of a map",
+            "",
+            "A step of Adam on splines of 128 × 128 cells, and a quasi-Newton step at triangles of "
+            f"domes, 5,400 of each. The collection has {SURFACES} surfaces, whose maps take "
+            "turns in a quasi-Newton step.",
+            "",
+            "| task | Adam, ms | quasi-Newton, ms | evaluations of the loss in it |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {task} | {v['adam_milliseconds']:.1f} | {v['quasi_newton_milliseconds']:.0f} | "
+            f"{v['evaluations']:.0f} |"
+            for task, v in results["loops"].items()
+        ]
+    lines += ["", "## On a GPU", "", *_ON_A_GPU]
     if "memory" in results:
         lines += [
             "",
@@ -602,7 +697,7 @@ def write_page() -> None:
 
 # tasks whose default trains a spline, by steps that the recipe has no counterpart of
 _SPLINES = ("param", "pair_map", "collection_map")
-PARTS = ("costs", "peak", "growth", "batches", "memory", "times")
+PARTS = ("costs", "peak", "growth", "batches", "loops", "memory", "times")
 
 
 def main() -> None:
@@ -634,6 +729,7 @@ def main() -> None:
         "peak": lambda: share_of_peak(arguments.rounds),
         "growth": lambda: growth(arguments.rounds),
         "batches": lambda: batches(arguments.rounds),
+        "loops": lambda: loops(arguments.rounds),
         "memory": memory,
         "times": lambda: times(arguments.mesh, arguments.seconds),
     }

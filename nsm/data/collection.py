@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import pytorch_lightning as pl
@@ -55,7 +56,8 @@ class CollectionData(pl.LightningDataModule):
         self.part = Shard.of(self.trainer)
         self.points = [SurfaceSampler(surface, device) for surface in self.surfaces]
         self.own_samplers = [ready(self.sampler, points, self.seed) for points in self.points]
-        self.starts = [start.to(device) for start in self.starts]
+        # copies: those of the task stay where they are
+        self.starts = [copy.deepcopy(start).to(device) for start in self.starts]
 
     def batch(self, step: int) -> Tensor:
         """The training samples (N, 2) of a step; of several processes, this one's share of them."""

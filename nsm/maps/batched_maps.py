@@ -11,11 +11,14 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from nsm.maps import bsplines
 from nsm.maps.composition import LatticeAligned, PointMap, Rotated
 from nsm.maps.encodings import value_and_jacobian_stack
 from nsm.maps.mlp_with_tangents import MLPWithTangents
 from nsm.maps.networks import SKIPS, NeuralMap, add_linear_skip
 from nsm.maps.planar import IdentityInitializedMap
+from nsm.maps.spline_field import SplineField
+from nsm.maps.tabulated import Tabulated
 from nsm.tensors import transformed
 
 
@@ -88,11 +91,47 @@ class OneByOne(nn.Module):
         return torch.stack(values), torch.stack(jacobians)
 
 
+class BatchedSplines(OneByOne):
+    """k splines on one grid, each with its own coefficients.
+
+    On the CPU they are evaluated one after the other, by compiled loops; elsewhere in one batch.
+
+    Args:
+        maps: k of them, for which :func:`_spline` has a grid, the same one.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(k, N, 2) points, N for each spline, to (k, N, n)."""
+        if x.device.type == "cpu":
+            return super().forward(x)
+        return self._stack(x, tangents=False)[0]
+
+    def value_and_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(k, N, 2) to the values (k, N, n) and Jacobians (k, N, n, 2)."""
+        if x.device.type == "cpu":
+            return super().value_and_jacobian(x)
+        stack = self._stack(x, tangents=True)
+        return stack[0], stack[1:].permute(1, 2, 3, 0)
+
+    def _stack(self, x: Tensor, tangents: bool) -> Tensor:
+        grids, tables = zip(*(_spline(m) for m in self.maps), strict=True)
+        return bsplines.read_each(x.to(tables[0].dtype), grids[0], tables, tangents)
+
+
+def _spline(map: nn.Module) -> tuple[bsplines.Grid, Tensor] | tuple[None, None]:
+    """The grid and the coefficients (rows, n) of a map that is one spline; None: it is not."""
+    if isinstance(map, SplineField):
+        return map.grids[0], map.coefficients
+    if isinstance(map, Tabulated):
+        return map.grid.grids[0], map.grid.tables[0]
+    return None, None
+
+
 def batched(maps: Sequence[nn.Module]) -> Any:
     """One map of points (k, N, 2), N for each of k maps.
 
-    Networks, planar maps and rotated ones that differ in their weights alone are evaluated in one
-    batch; any others one after the other. Gradients go to the weights of each.
+    Networks, splines, planar maps and rotated ones that differ in their weights alone are evaluated
+    in one batch; any others one after the other. Gradients go to the weights of each.
 
     Args:
         maps: k of them, with images of one dimension.
@@ -112,4 +151,7 @@ def batched(maps: Sequence[nn.Module]) -> Any:
             networks = cast(Sequence[NeuralMap], maps)
             if all(m.config == first.config for m in networks):
                 return BatchedNetworks(networks)
+    grid = _spline(first)[0]
+    if grid is not None and all(_spline(m)[0] == grid for m in maps):
+        return BatchedSplines(maps)
     return OneByOne(maps)

@@ -27,6 +27,7 @@ __all__ = [
     "Grid",
     "into_domain",
     "read",
+    "read_each",
     "read_plainly",
     "rows_of",
     "seen",
@@ -79,10 +80,34 @@ def read_plainly(
     parts = []
     for grid, table in zip(grids, tables, strict=True):
         rows, weights = _seen_plainly(x, grid)
-        # not an embedding, whose backward pass sorts
-        entries = table.index_select(0, rows.flatten()).view(*rows.shape, table.shape[1])
-        parts.append((weights[: 3 if tangents else 1, ..., None] * entries).sum(dim=2))
+        parts.append(_weighted(table, rows, weights, tangents))
     return torch.cat(parts, dim=-1)
+
+
+def read_each(x: Tensor, grid: Grid, tables: Sequence[Tensor], tangents: bool) -> Tensor:
+    """Splines on one grid, each at its own points, in one batch: operations as those of
+    :func:`read_plainly`.
+
+    Args:
+        x: (k, N, 2).
+        grid: of all of them.
+        tables: k of coefficients, (rows, F), of one type.
+        tangents: whether the derivatives along both axes are wanted, too.
+
+    Returns:
+        (P, k, N, F), P = 1, or 3 with ``tangents``.
+    """
+    rows, weights = _seen_plainly(x.flatten(0, 1), grid)
+    first = len(tables[0]) * torch.arange(len(tables), device=x.device)
+    rows = (rows.view(len(tables), -1) + first[:, None]).view(rows.shape)
+    return _weighted(torch.cat(list(tables)), rows, weights, tangents).unflatten(1, x.shape[:2])
+
+
+def _weighted(table: Tensor, rows: Tensor, weights: Tensor, tangents: bool) -> Tensor:
+    """Sums (P, N, F) of the rows (N, k²) of a table, with weights (3, N, k²)."""
+    # not an embedding, whose backward pass sorts
+    entries = table.index_select(0, rows.flatten()).view(*rows.shape, table.shape[1])
+    return (weights[: 3 if tangents else 1, ..., None] * entries).sum(dim=2)
 
 
 def seen(x: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
@@ -110,7 +135,8 @@ def _seen_plainly(x: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
     periodic, y, sign = grid.symmetry != CLAMPED, x.t(), torch.ones_like(x[:, 0])
     if periodic:
         y, sign = into_domain(y, grid.symmetry == EVEN)
-    size = torch.tensor(grid.cells, device=x.device)[:, None]
+    # not a tensor from the host, whose copy a device waits for
+    size = torch.stack([torch.full((1,), cells, device=x.device) for cells in grid.cells])
     rate = size.to(x.dtype) / (2 * grid.half)
     z = (y + grid.half) * rate
     cell = z.detach().floor().nan_to_num(0.0).clamp(min=0).minimum(size.to(x.dtype) - 1)

@@ -59,8 +59,10 @@ class DivergenceGuard(Callback):
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer
     ) -> None:
         gradients = [p.grad for p in self.parameters if p.grad is not None]
-        norm = torch.nn.utils.get_total_norm(gradients)
-        good = bool(torch.isfinite(norm)) and (self.loss is None or bool(torch.isfinite(self.loss)))
+        finite = torch.isfinite(torch.nn.utils.get_total_norm(gradients))
+        if self.loss is not None:
+            finite = finite & torch.isfinite(self.loss)
+        good = bool(finite)  # the one number that a device is waited for
         if trainer.strategy.reduce_boolean_decision(good):  # all processes do the same
             if self.good is None or trainer.global_step % _EVERY == 0:
                 self._keep(trainer.global_step, pl_module, optimizer)

@@ -77,11 +77,24 @@ class AdamThenNewton(QuasiNewton):
         assert closure is not None
         with torch.enable_grad():
             loss = closure()
-        gradients = [field.coefficients.grad for field in self.fields]
-        if loss is None or any(g is None for g in gradients):  # rolled back
+        if loss is None or any(f.coefficients.grad is None for f in self.fields):  # rolled back
             return None
-        for field, adam, g in zip(self.fields, self.adams, gradients, strict=True):
-            state, lr = self.state[field.coefficients], self.param_groups[0]["lr"]
-            field.coefficients.add_(adam.change(g, state, count["step"], lr))  # type: ignore[arg-type]
+        for adam, fields in self._batches():
+            changes = adam.changes(
+                [field.coefficients.grad for field in fields],  # type: ignore[misc]
+                [self.state[field.coefficients] for field in fields],
+                count["step"],
+                self.param_groups[0]["lr"],
+            )
+            for field, change in zip(fields, changes, strict=True):
+                field.coefficients.add_(change)
         count["step"] += 1
         return loss
+
+    def _batches(self) -> list[tuple[MultilevelAdam, list[SplineField]]]:
+        """The fields that take a step together: on a device, where each operation has its own cost,
+        all that are alike."""
+        alike = len({field.grids + (field.out_dim,) for field in self.fields}) == 1
+        if alike and self.fields[0].coefficients.device.type != "cpu":
+            return [(self.adams[0], self.fields)]
+        return [(adam, [field]) for adam, field in zip(self.adams, self.fields, strict=True)]

@@ -90,9 +90,10 @@ class BoundaryBarrier(nn.Module):
     def forward(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
         """The term under h in a step of the training: a scalar."""
         image = h(self.uv)
-        if not image.isfinite().all():  # a step too far, which the loss then says
+        tail = _array(image)
+        if not np.isfinite(tail).all():  # a step too far, which the loss then says
             return image.sum() * torch.nan
-        sides = self._sides(image)
+        sides = self._sides(tail)
         begun = self._at_start(sides, step)
         new = max(0, self._crossings(sides) - begun.crossings)
         near = self._near(sides, begun.reach, image)
@@ -102,7 +103,7 @@ class BoundaryBarrier(nn.Module):
         """The second derivatives of the term by the distances, seen by each vertex apart."""
         with torch.no_grad():
             image = h(self.uv).double()
-            sides = self._sides(image)
+            sides = self._sides(_array(image))
             pairs = self._near(sides, self._at_start(sides, step).reach, image)
             _, second, normal, share = _barrier(image, pairs)
             each = second[:, None, None] / len(image) * normal[:, :, None] * normal[:, None, :]
@@ -112,8 +113,7 @@ class BoundaryBarrier(nn.Module):
             hessians.index_add_(0, pairs.head, share.square()[:, None, None] * each)
         return Curvature(h, self.uv, hessians)
 
-    def _sides(self, image: Tensor) -> _Sides:
-        tail = image.detach().double().cpu().numpy()
+    def _sides(self, tail: np.ndarray) -> _Sides:
         head = tail[self._head]
         return _Sides(tail, head, np.linalg.norm(head - tail, axis=1), cKDTree(0.5 * (tail + head)))
 
@@ -133,8 +133,8 @@ class BoundaryBarrier(nn.Module):
         apart = (side != vertex) & (self._head[side] != vertex)
         side, vertex = side[apart], vertex[apart]
         both = np.minimum(reach[0, vertex], reach[1, side])
-        found = (vertex, side, self._head[side])
-        a, b, c = (torch.from_numpy(each).to(like.device) for each in found)
+        found = np.stack([vertex, side, self._head[side]])
+        a, b, c = torch.from_numpy(found).to(like.device)
         return _Pairs(a, b, c, torch.from_numpy(both).to(like))
 
     def _crossings(self, sides: _Sides) -> int:
@@ -146,6 +146,11 @@ class BoundaryBarrier(nn.Module):
         across = orientation(a, b, c) * orientation(a, b, d) <= 0
         back = orientation(c, d, a) * orientation(c, d, b) <= 0
         return int((across & back).sum())
+
+
+def _array(image: Tensor) -> np.ndarray:
+    array: np.ndarray = image.detach().double().cpu().numpy()
+    return array
 
 
 def _barrier(image: Tensor, pairs: _Pairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from nsm.energies import At, boundary, first_fundamental_form, inside, outside
 from nsm.energies.metrics import determinant
 from nsm.maps import LatticeAligned, Rotated, batched
+from nsm.maps.batched_maps import OneByOne
 from nsm.settings import CollectionConstraints
 from nsm.tasks.collection_quadrature import CollectionQuadrature, Turn
 from nsm.tasks.constrained import ConstrainedMap
@@ -60,6 +61,7 @@ class CollectionMap(ConstrainedMap):
     Constraints = CollectionConstraints
     constraints: CollectionConstraints
     quadrature: CollectionQuadrature | None
+    ordered: Tensor
 
     def __init__(
         self,
@@ -108,9 +110,9 @@ class CollectionMap(ConstrainedMap):
         self._turn: Turn | None = None
         self.diagonals = diagonals
         i, j = torch.meshgrid(torch.arange(len(phis)), torch.arange(len(phis)), indexing="ij")
-        self.ordered = (i[i != j], j[i != j])
+        self.register_buffer("ordered", torch.stack([i[i != j], j[i != j]]), persistent=False)
         names = names or [str(k) for k in range(len(phis))]
-        both = zip(*(part.tolist() for part in self.ordered), strict=True)
+        both = zip(*self.ordered.tolist(), strict=True)
         self.pair_names = [f"pairs/{names[a]}_to_{names[b]}" for a, b in both]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -316,8 +318,14 @@ class CollectionMap(ConstrainedMap):
         return torch.stack([folds(det, self.global_step).mean() for folds, det in both]).sum()
 
     def _triangle_term(self) -> Tensor:
-        both = zip(self.map, self.fold_barrier, strict=True)
-        return torch.stack([barrier(h, self.global_step) for h, barrier in both]).sum()
+        barriers: Any = list(self.fold_barrier)
+        both = zip(self.map, barriers, strict=True)
+        corners = torch.stack([b.corners(h, self.global_step) for h, b in both])
+        # the CPU has nothing of a batch
+        together = OneByOne if corners.device.type == "cpu" else batched
+        images = together(list(self.map))(corners)
+        each = zip(barriers, images, strict=True)
+        return torch.stack([barrier.of_image(image) for barrier, image in each]).sum()
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
         distortion, evaluation = self._evaluated(batch)

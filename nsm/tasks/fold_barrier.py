@@ -64,14 +64,20 @@ class FoldBarrier(nn.Module):
 
     def forward(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
         """Mean ``unfold`` over the weakest triangles under h: a scalar."""
+        return self.of_image(h(self.corners(h, step)))
+
+    def corners(self, h: Callable[[Tensor], Tensor], step: int) -> Tensor:
+        """Points (3C, 2) of Ω: the corners of the C weakest triangles, one after the other."""
         # optimizers may evaluate the loss of a step several times: it must stay the same
         if step % self.every == 0 and step != self._looked:
             self._looked = step
             with torch.no_grad():
                 self._look(h, step // self.every)
-        corners = self.uv[self.faces[self.chosen]]
-        image = h(corners.reshape(-1, 2)).reshape(-1, 3, 2)
-        relative = _double_areas(image) / self.area[self.chosen]
+        return self.uv[self.faces[self.chosen]].reshape(-1, 2)
+
+    def of_image(self, image: Tensor) -> Tensor:
+        """The term, from the image (3C, 2) of :meth:`corners`."""
+        relative = _double_areas(image.reshape(-1, 3, 2)) / self.area[self.chosen]
         return unfold(relative, self.margin).mean()
 
     def _look(self, h: Callable[[Tensor], Tensor], number: int) -> None:
@@ -131,7 +137,7 @@ class Folds:
             return injectivity(determinant)
         if self._held is None or self._held[0] != step or self._held[1].shape != determinant.shape:
             scale = 1 / determinant.detach().double().abs().clamp(min=1e-12)
-            self._held = step, scale.clamp(max=_STEEP * float(scale.median()))
+            self._held = step, scale.clamp(max=_STEEP * scale.median())
         return unfold(determinant * self._held[1].to(determinant), _SMALL)
 
     def __getstate__(self) -> dict[str, object]:

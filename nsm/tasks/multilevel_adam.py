@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import MutableMapping, Sequence
 from typing import Any
 
 import torch
@@ -33,44 +33,62 @@ class MultilevelAdam:
         self.scales = [level_scale(n) for n in level_cells(field.cells, even=field.odd)]
         self.two_scale = TwoScale(field)
 
-    def change(
-        self, gradient: Tensor, state: MutableMapping[str, Any], step: int, lr: float
-    ) -> Tensor:
-        """What a step adds to the coefficients, and the moments after it in the state.
+    def changes(
+        self,
+        gradients: Sequence[Tensor],
+        states: Sequence[MutableMapping[str, Any]],
+        step: int,
+        lr: float,
+    ) -> Sequence[Tensor]:
+        """What a step adds to the coefficients of splines alike, in one batch.
 
         Args:
-            gradient: (rows, d) by the coefficients.
-            state: of the optimizer; the moments of each level are ``moments_NUMBER`` (2, d, n, m).
+            gradients: (rows, d) by the coefficients of each.
+            states: of the optimizer; a level's moments are ``moments_NUMBER`` (2, d, n, m), and
+                after the call those of this step.
             step: from 0.
             lr: the rate.
         """
-        of_levels = [self.two_scale.table(gradient)]
+        count = len(gradients)
+        of_levels = [self.two_scale.table(_joined(gradients, 1))]  # (count · d, n, m)
         while len(of_levels) < len(self.scales):
             of_levels.insert(0, self.two_scale.transposed(of_levels[0]))
         of_levels = [scale * g for scale, g in zip(self.scales, of_levels, strict=True)]
         # one bad sample would be remembered in the moments for long
-        norm = torch.stack([g.norm() for g in of_levels]).norm()
+        norms = torch.stack([own.norm() for g in of_levels for own in g.chunk(count)])
+        norm = norms.view(-1, count).norm(dim=0)
         clip = (self.largest / norm.clamp(min=1e-30)).clamp(max=1.0)
+        clip = clip[:, None].expand(-1, len(of_levels[0]) // count).reshape(-1, 1, 1)
         total: Tensor | None = None
         for number, (g, scale) in enumerate(zip(of_levels, self.scales, strict=True)):
-            first, second = self._moments(state, number, g)
-            first.lerp_(clip * g, 1 - self.betas[0])
-            second.lerp_((clip * g).square(), 1 - self.betas[1])
+            key, shape = f"moments_{number}", (len(g) // count, *g.shape[1:])
+            moments = _joined([self._moments(state, key, g, shape) for state in states], 1)
+            for state, part in zip(states, moments.split(shape[0], dim=1), strict=True):
+                state[key] = part
+            first, second, g = *moments, clip * g
+            first.lerp_(g, 1 - self.betas[0])
+            second.lerp_(g.square(), 1 - self.betas[1])
             unbiased = [1 - beta ** (step + 1) for beta in self.betas]
             root = (second / unbiased[1]).sqrt_().add_(self.eps)
             own = first / root * (-lr * scale / unbiased[0])
             total = own if total is None else self.two_scale.refined(total) + own
         assert total is not None
-        return self.two_scale.rows(total)
+        return self.two_scale.rows(total).split(len(total) // count, dim=1)
 
-    def _moments(self, state: MutableMapping[str, Any], number: int, g: Tensor) -> Tensor:
-        key = f"moments_{number}"
+    @staticmethod
+    def _moments(
+        state: MutableMapping[str, Any], key: str, like: Tensor, shape: tuple[int, ...]
+    ) -> Tensor:
         if key not in state:
-            state[key] = torch.zeros(2, *g.shape, dtype=g.dtype, device=g.device)
-        elif state[key].dim() == 3:  # (2, rows, d) of an earlier version's checkpoint
-            state[key] = state[key].mT.reshape(2, *g.shape)
+            return like.new_zeros(2, *shape)
         moments: Tensor = state[key]
+        if moments.dim() == 3:  # (2, rows, d) of an earlier version's checkpoint
+            return moments.mT.reshape(2, *shape)
         return moments
+
+
+def _joined(parts: Sequence[Tensor], dim: int) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=dim)
 
 
 class TwoScale:

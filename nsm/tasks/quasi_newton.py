@@ -6,16 +6,16 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.optim import Optimizer
 
 from nsm.maps import SplineField
 from nsm.stages import at as shown
 from nsm.stages import part
 from nsm.tasks.curvature import Curvature
-from nsm.tasks.spline_level import Level, Metric
+from nsm.tasks.device_level import DeviceLevel
+from nsm.tasks.spline_level import Level
 
 _SUFFICIENT = 1e-4  # Armijo's condition
 _TRIALS = 14
@@ -27,12 +27,16 @@ _FIRST = 0.02
 _CONVERGED = 1e-4
 
 
+# of double precision: an array of numpy for the CPU, a tensor on any other device
+_Vector = Any
+
+
 class _Found(NamedTuple):
     """Loss and gradient on the level."""
 
     loss: Any
     value: float
-    gradient: np.ndarray
+    gradient: _Vector
 
 
 class QuasiNewton(Optimizer):
@@ -40,9 +44,9 @@ class QuasiNewton(Optimizer):
 
     A step begins with the matrix K of the loss's curvature (:class:`nsm.tasks.curvature.Curvature`)
     at the present coefficients, each component of a spline apart, with a little H¹ added; its
-    sparse factors are the metric in which L-BFGS begins. K is near enough to the Hessian that few
-    iterations follow, and they correct what it leaves out. Backtracking along each direction
-    ensures descent.
+    factors, sparse ones on the CPU, are the metric in which L-BFGS begins. K is near enough to the
+    Hessian that few iterations follow, and they correct what it leaves out. Backtracking along each
+    direction ensures descent.
 
     A level of n × n cells is a subspace of the finest grid by the two-scale relation of B-splines,
     so a finer level begins with the same function.
@@ -98,8 +102,8 @@ class QuasiNewton(Optimizer):
         self.turns: Callable[[], Iterable[nn.Module]] = lambda: [nn.ModuleList(fields)]
         fresh = not any(f.coefficients.detach().count_nonzero() for f in fields)
         self.state[self.fields[0].coefficients]["step"] = 0 if fresh else sum(steps)
-        self._level: tuple[int, list[Level]] | None = None
-        self._moving: list[tuple[SplineField, Level]] = []
+        self._level: tuple[int, list[Level | DeviceLevel]] | None = None
+        self._moving: list[tuple[SplineField, Level | DeviceLevel]] = []
 
     def watch(
         self,
@@ -143,7 +147,7 @@ class QuasiNewton(Optimizer):
         state = self.state[self.fields[0].coefficients]
         number = sum(state["step"] >= end for end in accumulate(self.counts))
         if self._level is None or self._level[0] != number:
-            self._level = number, [Level(f, self.levels[number]) for f in self.fields]
+            self._level = number, [level_of(f, self.levels[number]) for f in self.fields]
         state["step"] += 1
         loss, hardly = None, True
         for k, moving in enumerate(self.turns()):
@@ -161,10 +165,9 @@ class QuasiNewton(Optimizer):
         state["converged"] = number == len(self.counts) and hardly
         return loss
 
-    def _now(self) -> np.ndarray:
+    def _now(self) -> _Vector:
         """The present coefficients on the level, of what moves."""
-        each = [level.restored(_array(field.coefficients)) for field, level in self._moving]
-        return np.concatenate([c.ravel() for c in each])
+        return self._joined([level.restored(field.coefficients) for field, level in self._moving])
 
     def _descended(self, closure: Callable[[], Any], found: _Found) -> _Found | None:
         """What is found after the iterations, from what is found at the present coefficients."""
@@ -180,7 +183,7 @@ class QuasiNewton(Optimizer):
                 break
         return found
 
-    def _evaluated(self, closure: Callable[[], Any], at: np.ndarray) -> _Found | None:
+    def _evaluated(self, closure: Callable[[], Any], at: _Vector) -> _Found | None:
         """Loss and gradient at coefficients of the level; None if the step was rolled back."""
         self._put(at)
         with torch.enable_grad():
@@ -190,16 +193,16 @@ class QuasiNewton(Optimizer):
         ]
         if loss is None or len(gradients) < len(self._moving):
             return None
-        value, parts = float(loss), []
+        value, parts = self._moving[0][1].vector(torch.as_tensor(loss, dtype=torch.float64)), []
         for (_, level), g, c in zip(self._moving, gradients, self._split(at), strict=True):
             rough = level.smoothness @ c
-            value += self.smoothing * float((c * rough).sum())
-            parts.append(level.up.T @ _array(g) + 2 * self.smoothing * rough)
-        return _Found(loss, value, np.concatenate([part.ravel() for part in parts]))
+            value = value + self.smoothing * (c * rough).sum()
+            parts.append(level.down @ level.vector(g) + 2 * self.smoothing * rough)
+        return _Found(loss, float(value), self._joined(parts))
 
     def _searched(
-        self, closure: Callable[[], Any], search: _Search, at: np.ndarray, found: _Found
-    ) -> tuple[np.ndarray, _Found, bool] | None:
+        self, closure: Callable[[], Any], search: _Search, at: _Vector, found: _Found
+    ) -> tuple[_Vector, _Found, bool] | None:
         """One iteration: the coefficients and what is found there, and whether no step serves."""
         d = -search.direction(found.gradient)
         slope, length = float(found.gradient @ d), search.first(d, self.first_length)
@@ -216,79 +219,78 @@ class QuasiNewton(Optimizer):
         self._put(at)
         return at, found, True
 
-    def _metric(self, known: Sequence[Curvature]) -> Callable[[np.ndarray], np.ndarray]:
+    def _metric(self, known: Sequence[Curvature]) -> Callable[[_Vector], _Vector]:
         """The inverse of K on the level, at the present coefficients."""
-        matrices = [
-            np.tile(level.regularizer(self.smoothing), (level.out_dim, 1))
-            for _, level in self._moving
-        ]
-        place = {id(field): k for k, (field, _) in enumerate(self._moving)}
+        seen: dict[int, list[Any]] = {id(field): [] for field, _ in self._moving}
         for curvature in known:
             field, x, blocks = curvature.of_field()
-            k = place[id(field)]
-            matrices[k] += self._moving[k][1].matrices(x, blocks)
-        metrics = [
-            Metric(level, entries)
-            for entries, (_, level) in zip(matrices, self._moving, strict=True)
-        ]
+            seen[id(field)].append((x, blocks))
+        metrics = [level.metric(self.smoothing, seen[id(f)]) for f, level in self._moving]
 
-        def solve(g: np.ndarray) -> np.ndarray:
+        def solve(g: _Vector) -> _Vector:
             parts = zip(metrics, self._split(g), strict=True)
-            return np.concatenate([metric.solve(part).ravel() for metric, part in parts])
+            return self._joined([metric.solve(part) for metric, part in parts])
 
         return solve
 
-    def _split(self, flat: np.ndarray) -> list[np.ndarray]:
+    def _split(self, flat: _Vector) -> list[_Vector]:
         """A vector of the coefficients on the level of what moves, by field, each (rows, d)."""
-        ends = accumulate(level.rows * level.out_dim for _, level in self._moving)
-        parts = np.split(flat, list(ends)[:-1])
-        return [p.reshape(-1, f.out_dim) for p, (f, _) in zip(parts, self._moving, strict=True)]
+        parts, end = [], 0
+        for _, level in self._moving:
+            start, end = end, end + level.rows * level.out_dim
+            parts.append(flat[start:end].reshape(-1, level.out_dim))
+        return parts
 
-    def _put(self, at: np.ndarray) -> None:
+    def _joined(self, parts: list[_Vector]) -> _Vector:
+        """The inverse of :meth:`_split`."""
+        return self._moving[0][1].joined(parts)
+
+    def _put(self, at: _Vector) -> None:
         for (field, level), c in zip(self._moving, self._split(at), strict=True):
-            field.coefficients.copy_(torch.from_numpy(level.up @ c))
+            field.coefficients.copy_(level.tensor(level.up @ c))
+
+
+def level_of(field: SplineField, cells: int) -> Level | DeviceLevel:
+    """A level of a field, for the device where the field is."""
+    level, device = Level(field, cells), field.coefficients.device
+    return level if device.type == "cpu" else DeviceLevel(level, device)
 
 
 class _Search:
     """The two-loop recursion (Nocedal and Wright, Algorithm 7.4) from the inverse of a metric."""
 
-    def __init__(self, memory: int, solve: Callable[[np.ndarray], np.ndarray], known: bool) -> None:
+    def __init__(self, memory: int, solve: Callable[[_Vector], _Vector], known: bool) -> None:
         self.memory, self.solve, self.known = memory, solve, known
-        self.s: list[np.ndarray] = []
-        self.y: list[np.ndarray] = []
-        self.scale = 1.0
+        self.pairs: list[tuple[_Vector, _Vector, Any]] = []  # s, y and their product
+        self.scale: Any = 1.0
 
-    def direction(self, g: np.ndarray) -> np.ndarray:
+    def direction(self, g: _Vector) -> _Vector:
         """The inverse of the approximate Hessian times a gradient."""
-        q, shares = g.copy(), []
-        pairs = list(zip(self.s, self.y, strict=True))
-        for s, y in reversed(pairs):
-            shares.append((s @ q) / (s @ y))
+        q, shares = 1.0 * g, []  # a copy
+        for s, y, product in reversed(self.pairs):
+            shares.append((s @ q) / product)
             q -= shares[-1] * y
         d = self.scale * self.solve(q)
-        for s, y in pairs:
-            d += (shares.pop() - (y @ d) / (s @ y)) * s
+        for s, y, product in self.pairs:
+            d += (shares.pop() - (y @ d) / product) * s
         return d
 
-    def first(self, d: np.ndarray, lr: float) -> float:
+    def first(self, d: _Vector, lr: float) -> float:
         """The first length to be tried along a direction."""
-        if self.known or self.s:
+        if self.known or self.pairs:
             return lr
-        return min(lr, _FIRST / max(float(np.abs(d).max()), 1e-30))
+        return min(lr, _FIRST / max(float(abs(d).max()), 1e-30))
 
-    def learn(self, s: np.ndarray, y: np.ndarray) -> None:
+    def learn(self, s: _Vector, y: _Vector) -> None:
         """Take a step and the change of the gradient."""
-        if s @ y > _FLAT * np.linalg.norm(s) * np.linalg.norm(y):
-            if not self.s:
-                self.scale = (s @ y) / (y @ self.solve(y))
-            self.s, self.y = [*self.s, s][-self.memory :], [*self.y, y][-self.memory :]
+        product = s @ y
+        if product > _FLAT * ((s @ s) * (y @ y)) ** 0.5:
+            if not self.pairs:
+                self.scale = product / (y @ self.solve(y))
+            self.pairs = [*self.pairs, (s, y, product)][-self.memory :]
 
     def forget(self) -> bool:
         """Begin again from the metric; False if nothing was learned."""
-        learned = bool(self.s)
-        self.s, self.y = [], []
+        learned = bool(self.pairs)
+        self.pairs = []
         return learned
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().double().numpy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +20,7 @@ from nsm.tasks.sparse_cholesky import Elimination
 # of H¹ beside the curvature of the loss: it decides where no point sees a coefficient
 _FLOOR = 1e-3
 _SEEN = 9  # coefficients, by a point: those of a cell
+Seen = tuple[Tensor, Tensor]
 
 
 class Level:
@@ -28,9 +30,14 @@ class Level:
         field: its coefficients' number, type and symmetry count.
         cells: n; the field has n times a power of two.
 
+    What it takes and gives are vectors of double precision, for the CPU as arrays of numpy: there
+    its loops are compiled. For other devices :class:`nsm.tasks.device_level.DeviceLevel` does the
+    same with tensors.
+
     Attributes:
         grid: a spline of n cells, of one value.
         up: (rows of the field, rows of the level): the same spline's coefficients on the fine grid.
+        down: its transpose, from gradients by the fine coefficients to those by the level's.
         floor: (rows, rows), a little H¹ that the loss's curvature is added to.
         smoothness: (rows, rows), ∫ of the squared second derivatives in units of the cells' size
             to the power of -1: the mean squared change of the first derivatives over a cell.
@@ -54,9 +61,25 @@ class Level:
         whole = _whole(self.grid)
         fine = field.side**2 // 2 if field.odd else field.side**2
         self.up = (kron(along, along).tocsr() @ whole)[:fine].tocsr()
+        self.down = self.up.T
         inner, smooth = _forms(self.grid.side, cells, field.periodic)
         self.floor = (_FLOOR * (whole.T @ inner @ whole)).tocsr()
         self.smoothness = (whole.T @ smooth @ whole).tocsr()
+
+    @staticmethod
+    def vector(tensor: Tensor) -> np.ndarray:
+        """A tensor as an array in double precision."""
+        return tensor.detach().cpu().double().numpy()
+
+    @staticmethod
+    def tensor(vector: np.ndarray) -> Tensor:
+        """The inverse of :meth:`vector`."""
+        return torch.from_numpy(vector)
+
+    @staticmethod
+    def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+        """One vector of parts, each flattened."""
+        return np.concatenate([part.ravel() for part in parts])
 
     @property
     def rows(self) -> int:
@@ -116,12 +139,25 @@ class Level:
         floor, smooth = self._entries
         return floor + 2 * smoothing * smooth
 
-    def restored(self, fine: np.ndarray) -> np.ndarray:
+    def restored(self, fine: Tensor) -> np.ndarray:
         """The level's coefficients (rows, d) of a spline of the level, given on the fine grid."""
+        given = self.vector(fine)
         if self.up.shape[0] == self.up.shape[1]:
-            return fine
-        normal = splu((self.up.T @ self.up).tocsc())
-        return np.asarray(normal.solve(self.up.T @ fine))
+            return given
+        normal = splu((self.down @ self.up).tocsc())
+        return np.asarray(normal.solve(self.down @ given))
+
+    def metric(self, smoothing: float, seen: Iterable[Seen]) -> Metric:
+        """The metric of a step: what points see, and the :meth:`regularizer`.
+
+        Args:
+            smoothing: weight of the smoothness.
+            seen: points and their blocks, as :meth:`matrices` takes them.
+        """
+        entries = np.tile(self.regularizer(smoothing), (self.out_dim, 1))
+        for x, blocks in seen:
+            entries += self.matrices(x, blocks)
+        return Metric(self, entries)
 
     def matrices(self, x: Tensor, blocks: Tensor) -> np.ndarray:
         """Σ Wᵀ H W over points, W their weights on the level.

@@ -107,7 +107,7 @@ class Distortion:
 
     def _mean(self, values: Tensor) -> Tensor:
         if self.share is None:
-            return values.sum() / mean_of_processes(values.new_tensor(max(1, values.numel())))
+            return values.sum() / mean_of_processes(values.new_full((), max(1, values.numel())))
         return self._means(values, self.share).mean()
 
     @staticmethod

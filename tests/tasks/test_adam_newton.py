@@ -33,7 +33,7 @@ def test_a_step_is_that_of_torch_on_the_coordinates_of_the_levels(periodic, odd)
     for step in range(4):
         # a different gradient in each step, some of them longer than the limit
         gradient = torch.randn(c.shape, generator=generator).double() * 10.0 ** (step - 2)
-        c += adam.change(gradient, state, step, 0.02)
+        c += adam.changes([gradient], [state], step, 0.02)[0]
         for part, up, n in zip(y, ups, (4, 8, 16), strict=True):
             part.grad = 0.5 / n**0.5 * (up.T @ gradient)
         torch.nn.utils.clip_grad_norm_(y, 0.3)
@@ -113,7 +113,25 @@ def test_moments_of_an_earlier_version_go_on():
     gradients = torch.randn(2, *field.coefficients.shape, generator=generator).double()
     adam = MultilevelAdam(field, (0.9, 0.99), 1e-12, largest=1.0)
     state = {}
-    adam.change(gradients[0], state, 0, 0.02)
+    adam.changes([gradients[0]], [state], 0, 0.02)
     earlier = {key: moments.flatten(2).mT.clone() for key, moments in state.items()}  # (2, rows, d)
-    wanted = adam.change(gradients[1], state, 1, 0.02)
-    torch.testing.assert_close(adam.change(gradients[1], earlier, 1, 0.02), wanted)
+    [wanted] = adam.changes([gradients[1]], [state], 1, 0.02)
+    [found] = adam.changes([gradients[1]], [earlier], 1, 0.02)
+    torch.testing.assert_close(found, wanted)
+
+
+def test_splines_alike_take_a_step_in_one_batch_as_each_would():
+    field = SplineField(2, 16, True, True).double()
+    generator = torch.Generator().manual_seed(3)
+    adam, several, alone = (
+        MultilevelAdam(field, (0.9, 0.99), 1e-12, largest=1.0),
+        [{}, {}],
+        [{}, {}],
+    )
+    for step in range(3):
+        # of one alone the gradient is longer than the limit
+        gradients = torch.randn(2, *field.coefficients.shape, generator=generator).double()
+        gradients[0] *= 1e-3
+        found = adam.changes(list(gradients), several, step, 0.02)
+        for g, state, change in zip(gradients, alone, found, strict=True):
+            torch.testing.assert_close(change, adam.changes([g], [state], step, 0.02)[0])
