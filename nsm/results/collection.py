@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nsm.domains import BoundedDomain
 from nsm.errors import NsmError
 from nsm.maps import PlanarMap, TransitionMap
-from nsm.maps.inverse import Inverse
+from nsm.maps.inverse import Inverse, inverted
 from nsm.results.artifact import NeuralSurface, load_surface, save_surface
 from nsm.results.certificate import Correction, combined
 from nsm.results.files import DAMAGE, damaged, read_pair, write_pair
@@ -32,6 +32,7 @@ STEM = "collection"
 _CYCLE_EVERY = 7  # every so many vertices, one is followed around a cycle
 _CHUNK = 16_384  # vertices whose h_i⁻¹ is computed at once
 _MOST_CYCLES = 60  # of k³
+_MET = 1e-6  # in Ω
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +140,40 @@ class SurfaceCollection:
     def _preimages(self, source: int) -> np.ndarray:
         """h_i⁻¹ at the vertices of a surface: (V, 2) in the common domain."""
         if source not in self._back:  # it takes longest, and all maps of a source share it
-            self._back[source] = self._pulled_back(source, self.surfaces[source].surface.uv)
+            s, h = self.surfaces[source].surface, _double(self.maps[source])
+            back = torch.as_tensor(self._pulled_back(source, s.uv))
+            # where h_i folds beside a landmark, several points lead there: the common one is meant
+            row, number = self._marked_rows(source)
+            if len(row):
+                wanted = torch.as_tensor(s.uv)[row]
+                start = s.domain.lift(self._agreed[number], back[row])
+                found = inverted(h, wanted, start, self._project)
+                met = (h(found) - wanted).norm(dim=1) < _MET
+                back[row[met.numpy()]] = found[met]
+            self._back[source] = back.numpy()
         return self._back[source]
+
+    def _marked_rows(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """The rows (R,) of a surface's uv that are landmarks, all copies, and which (R,) these
+        are."""
+        s, ids = self.surfaces[number].surface, self.landmarks[:, number]
+        mine = np.flatnonzero(ids >= 0)
+        row, which = np.nonzero(s.source_vertex[:, None] == s.kept(ids[mine].tolist()))
+        return row, mine[which]
+
+    @cached_property
+    def _agreed(self) -> Tensor:
+        """The landmarks in the common domain, (L, 2): of the places where the surfaces' maps have
+        one, that nearest to all."""
+        every = torch.stack([self._places(n) for n in range(len(self))])  # (k, L, 2)
+        domain, whole = self.surfaces[0].surface.domain, every.flatten(0, 1)
+        total = []
+        for one in every:
+            here = one.repeat(len(every), 1)
+            apart = (domain.lift(whole, here) - here).norm(dim=1).view(len(every), -1)
+            total.append(apart.nansum(dim=0).where(one.isfinite().all(dim=1), torch.inf))
+        best = torch.stack(total).argmin(dim=0)
+        return every[best, torch.arange(every.shape[1])]
 
     def _pulled_back(self, source: int, uv: np.ndarray) -> np.ndarray:
         """h_i⁻¹ at points (N, 2) of a surface's domain: (N, 2) in the common domain."""
@@ -166,10 +199,8 @@ class SurfaceCollection:
         """
         s = self.surfaces[source].surface
         near: Tensor = _double(self.maps[source]).back(torch.as_tensor(s.uv))  # type: ignore[operator]
-        ids = self.landmarks[:, source]
-        mine = np.flatnonzero(ids >= 0)
-        row, number = np.nonzero(s.source_vertex[:, None] == s.kept(ids[mine].tolist()))
-        others = [self._places(n)[mine[number]] for n in range(len(self)) if n != source]
+        row, number = self._marked_rows(source)
+        others = [self._places(n)[number] for n in range(len(self)) if n != source]
         common = [x.isfinite().all(dim=1) for x in others]
         both = zip(others, common, strict=True)
         return torch.cat([near, *(s.domain.lift(x[there], near[row][there]) for x, there in both)])
