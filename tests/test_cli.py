@@ -14,7 +14,7 @@ import yaml
 from tiny import TRAINING
 
 import nsm
-from nsm import cli
+from nsm import cli, stages
 from nsm.arguments import Arguments
 
 OLDER = Path(__file__).parent / "data_v1"
@@ -92,7 +92,9 @@ def test_a_mistaken_command_line_is_one_line_and_status_2(echo, here):
         (["resume=nowhere", "seed=1"], "seed=1"),
     ],
 )
-def test_a_mistake_is_one_line(here, arguments, named):
+def test_a_mistake_is_one_line(here, arguments, named, monkeypatch):
+    # on a busy machine, the import of torch takes so long that progress is printed
+    monkeypatch.setattr(stages, "QUIET_FOR", 600.0)
     result = here(*arguments)
     assert (result.returncode, result.stdout) == (2, "")
     assert named in result.stderr
