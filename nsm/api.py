@@ -60,6 +60,7 @@ def overfit(
         >>> phi = nsm.overfit(nsm.Surface.load("terrain"), experiment="quick")
         >>> phi(uv)  # (N, 2) points of Ω to (N, 3)
     """
+    _needed("surface", surface)
     ready = [surface] if isinstance(surface, Surface) else []
     request = _Request("overfit", overrides, settings, ready)
     with request.run(folder, progress) as (config, place):
@@ -93,6 +94,7 @@ def parameterize(
         >>> flat = nsm.parameterize(phi)
         >>> flat.uv  # (V, 2), of the cut mesh's vertices
     """
+    _needed("phi", phi)
     given = phi.surface if isinstance(phi, NeuralSurface) else phi
     request = _Request("param", overrides, settings, [given] if isinstance(given, Surface) else [])
     with request.run(folder, progress) as (config, place):
@@ -306,6 +308,17 @@ class _Request:
             raise NsmError(
                 f"{of_disk(error)}; give another folder, or make room", kind="unwritable_folder"
             ) from error
+
+
+def _needed(name: str, given: Any) -> None:
+    """Refuse None, in whose place the settings' own surface would be taken."""
+    if given is None:
+        raise NsmError(
+            f"{name}: None is no mesh; give a file, a catalogue name, an object of trimesh or a "
+            "pair (vertices, faces)",
+            kind="wrong_type",
+            key=name,
+        )
 
 
 def _plain(key: str, value: Any) -> Any:

@@ -15,7 +15,7 @@ import pytorch_lightning as pl
 import torch
 import trimesh
 from hydra.core.config_store import ConfigStore
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from thorough import examples
@@ -579,6 +579,7 @@ def test_good_landmarks_are_accepted_and_bad_ones_refused_first(untrained, pairs
     st.sampled_from([NEURAL[0].surface, NEURAL[0], None, 3, "terrain"]),
     st.lists(st.text(max_size=8) | st.sampled_from(["seed=1", "seed=x", "energy=a"]), max_size=2),
 )
+@example(thing=None, overrides=[])
 def test_what_overfit_and_parameterize_are_given(untrained, thing, overrides):
     good = all(word == "seed=1" for word in overrides)
     for function, kinds in (
