@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import platform
-import resource
 import shutil
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from waiting import cpu_seconds, peak_mib
 
 from nsm.surfaces import shapes
 
@@ -95,17 +95,6 @@ class Stages:
                 entry["peak_mib"] = peak_mib()
 
         setattr(owner, name, measured)
-
-
-def cpu_seconds() -> float:
-    """CPU time of the process and of those that it started and that have ended: neural surfaces are
-    made side by side."""
-    now = os.times()
-    return now.user + now.system + now.children_user + now.children_system
-
-
-def peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def overfit(mesh: Callable[[], shapes.Mesh], folder: Path) -> dict[str, Any]:

@@ -76,13 +76,13 @@ OWN_TRAINING = "φ: training"
 REST = "the rest"
 
 
-def seconds() -> float:
+def cpu_seconds() -> float:
     """CPU seconds of this process and of those that it started and that have ended."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
 
 
-def peak() -> float:
+def peak_mib() -> float:
     """The most memory of this process so far, in MiB."""
     kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return kilobytes / 1024 if sys.platform != "darwin" else kilobytes / 1024**2
@@ -99,10 +99,10 @@ class Clock:
         self.spent: dict[str, float] = {}
         self.of_surface = of_surface
         self._running = [REST]
-        self._since = seconds()
+        self._since = cpu_seconds()
 
     def _turn(self) -> None:
-        now = seconds()
+        now = cpu_seconds()
         stage = self._running[-1]
         self.spent[stage] = self.spent.get(stage, 0.0) + now - self._since
         self._since = now
@@ -140,15 +140,13 @@ def overrides_of(case: str, meshes: Path) -> list[str]:
         domain = [] if case == "overfit" else ["domain=disc"]
         return [f"task={case}", f"surface.path={first}", *domain]
     marks = [str(meshes / "landmarks" / f"{name}.vts") for name in PAIR]
-    extra = {"disc": ["domain=disc"]}.get(case, [])
-    if case in ("fast", "adam"):
-        extra = [f"experiment={case}"]
+    ways = {"fast": ["experiment=fast"], "adam": ["experiment=adam"], "disc": ["domain=disc"]}
     return [
         "task=pair_map",
         f"source={first}",
         f"target={meshes / PAIR[1]}.off",
         f"landmarks=[{','.join(marks)}]",
-        *extra,
+        *ways.get(case, []),
     ]
 
 
@@ -167,7 +165,7 @@ def run(case: str, meshes: Path, extra: list[str]) -> dict[str, Any]:
         config = checked(compose_config(overrides), overrides)
     torch.set_num_threads(1)
     clock._turn()
-    imports = seconds()  # since the process began
+    imports = cpu_seconds()  # since the process began
     clock.spent = {"imports": imports}
     for place, name, stage in STAGES:
         module, _, kind = place.partition(":")
@@ -188,7 +186,7 @@ def run(case: str, meshes: Path, extra: list[str]) -> dict[str, Any]:
         "stages": spent,
         "cpu_seconds": round(sum(spent.values()), 2),
         "wall_seconds": round(time.perf_counter() - begun, 1),
-        "peak_mib": round(peak()),
+        "peak_mib": round(peak_mib()),
         "figures": {key: round(float(figures[key]), 5) for key in kept if key in figures},
     }
 

@@ -28,6 +28,7 @@ from nsm.results import (
 )
 from nsm.results.parameterization_atlas import ParameterizationAtlas
 from nsm.run_directories import temporary_folder
+from nsm.surfaces.given import no_mesh
 
 
 def overfit(
@@ -313,12 +314,7 @@ class _Request:
 def _needed(name: str, given: Any) -> None:
     """Refuse None, in whose place the settings' own surface would be taken."""
     if given is None:
-        raise NsmError(
-            f"{name}: None is no mesh; give a file, a catalogue name, an object of trimesh or a "
-            "pair (vertices, faces)",
-            kind="wrong_type",
-            key=name,
-        )
+        raise no_mesh("None", name)
 
 
 def _plain(key: str, value: Any) -> Any:

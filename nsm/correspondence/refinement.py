@@ -114,9 +114,8 @@ class Batch:
         self.scale = tensor(scale)  # (H, N)
         self.inverse_scale = tensor(np.linalg.det(matrices)[:, None] / scale)
         self.area = tensor(sources[0].area)
-        self.cells, self.number = len(tables[0].log_metric), torch.as_tensor(number)
-        self.bilinear = tensor(np.concatenate([_bilinear(t.log_metric) for t in tables]))
-        self.by_cell = self.bilinear.view(len(tables), self.cells, self.cells, 4, 3)
+        self.number = torch.as_tensor(number)
+        self.bilinear = tensor(np.stack([_bilinear(t.log_metric) for t in tables]))
         self.matrices, self.shifts = tensor(matrices), tensor(shifts)
         self.anchors = anchors
         if anchors is not None:
@@ -151,7 +150,7 @@ class Batch:
             return self._plain_energies(h)
         limits = _EPSILON, _LEAST_DETERMINANT, _CAPPED
         found: Tensor = Energies.apply(
-            h, self.number, self.by_cell, self.inverse_scale, self.scale, self.area, limits
+            h, self.number, self.bilinear, self.inverse_scale, self.scale, self.area, limits
         )
         return found
 
@@ -173,24 +172,22 @@ class Batch:
 
     def _log_metrics(self, x: Tensor, y: Tensor) -> Tensor:
         """(m, a, b) (3, H, N) of the targets' tables at points (H, N), bilinear."""
-        n = self.cells
+        n = self.bilinear.shape[1]
         s, t = 0.5 * n * x, 0.5 * n * y
         i, j = torch.floor(s.detach()), torch.floor(t.detach())
         row, column = torch.remainder(i.long(), n), torch.remainder(j.long(), n)
         cell = n * (n * self.number[:, None] + row) + column
-        rows = self.bilinear.index_select(0, cell.view(-1))
+        rows = self.bilinear.view(-1, 12).index_select(0, cell.view(-1))
         one, by_u, by_v, by_uv = rows.T.contiguous().view(4, 3, *x.shape)
         u, v = s - i, t - j
         return one + u * by_u + v * (by_v + u * by_uv)
 
 
 def _bilinear(grid: np.ndarray) -> np.ndarray:
-    """Coefficients (N², 12) of 1, u, v and uv for the cells of a periodic grid (N, N, 3)."""
+    """Coefficients (N, N, 4, 3) of 1, u, v and uv for the cells of a periodic grid (N, N, 3)."""
     far, right = np.roll(grid, -1, axis=0), np.roll(grid, -1, axis=1)
     both = np.roll(far, -1, axis=1)
-    return np.concatenate(
-        [grid, far - grid, right - grid, both - far - right + grid], axis=2
-    ).reshape(-1, 12)
+    return np.stack([grid, far - grid, right - grid, both - far - right + grid], axis=2)
 
 
 def refined(batch: Batch, amplitudes: Tensor, steps: int) -> tuple[Tensor, Tensor]:

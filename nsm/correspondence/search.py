@@ -296,12 +296,12 @@ def trained(
             another with more force; none by default.
     """
     waves = len(Sines.up_to(one.largest).waves)
-    by_layout: dict[int, dict[int, list[int]]] = {}
+    by_shape: dict[int, dict[int, list[int]]] = {}  # and by layout
     for k, candidate in enumerate(found):
-        of_shape = by_layout.setdefault(id(candidate.source.shape), {})
-        of_shape.setdefault(id(candidate.source), []).append(k)
+        layouts = by_shape.setdefault(id(candidate.source.shape), {})
+        layouts.setdefault(id(candidate.source), []).append(k)
     result = list(found)
-    for layouts in by_layout.values():
+    for layouts in by_shape.values():
         members = [k for of_layout in layouts.values() for k in of_layout]
         group_ = [found[k] for k in members]
         tables = list({id(c.table): c.table for c in group_}.values())

@@ -58,15 +58,20 @@ def given_mesh(given: Any, name: str = "mesh") -> GivenMesh:
     elif isinstance(given, (tuple, list)) and len(given) == 2:
         vertices, faces = (x.detach().cpu() if hasattr(x, "detach") else x for x in given)
     else:
-        raise NsmError(
-            f"{name}: a {type(given).__name__} is no mesh; give a file, a catalogue name, an "
-            "object of trimesh or a pair (vertices, faces)",
-            kind="wrong_type",
-            key=name,
-        )
+        raise no_mesh(f"a {type(given).__name__}", name)
     vertices, faces = as_arrays(vertices, faces, name)
     check_arrays(vertices, faces, name)
     return GivenMesh(name, vertices, faces, log)
+
+
+def no_mesh(what: str, name: str) -> NsmError:
+    """The error of what was given in place of a mesh."""
+    return NsmError(
+        f"{name}: {what} is no mesh; give a file, a catalogue name, an object of trimesh or a pair "
+        "(vertices, faces)",
+        kind="wrong_type",
+        key=name,
+    )
 
 
 def _file_of(mesh: Any) -> Path | None:

@@ -171,12 +171,8 @@ class ConstrainedMap(AtTriangles):
         """
         found = []
         if len(self.points):
-            of_landmarks = (
-                2
-                * scale
-                * self.landmark_weight
-                * torch.eye(2, dtype=self.points.dtype, device=self.points.device)
-            )
+            identity = torch.eye(2, dtype=self.points.dtype, device=self.points.device)
+            of_landmarks = 2 * scale * self.landmark_weight * identity
             found.append(Curvature(h, self.points, held[:, None, None] * of_landmarks))
         if len(self.seam) and self.loss_weights.seam > 0:
             ends = self.seam.reshape(-1, 2)

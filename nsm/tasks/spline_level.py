@@ -26,13 +26,13 @@ Seen = tuple[Tensor, Tensor]
 class Level:
     """The splines of n × n cells among those of a field's own grid.
 
-    Args:
-        field: its coefficients' number, type and symmetry count.
-        cells: n; the field has n times a power of two.
-
     What it takes and gives are vectors of double precision, for the CPU as arrays of numpy: there
     its loops are compiled. For other devices :class:`nsm.tasks.device_level.DeviceLevel` does the
     same with tensors.
+
+    Args:
+        field: its coefficients' number, type and symmetry count.
+        cells: n; the field has n times a power of two.
 
     Attributes:
         grid: a spline of n cells, of one value.

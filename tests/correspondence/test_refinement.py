@@ -169,7 +169,7 @@ def test_layouts_of_one_shape_in_one_batch_are_as_one_by_one():
     first = SimpleNamespace(at=POINTS, inverse=np.tile(np.eye(2), (len(POINTS), 1, 1)), area=None)
     first.area = np.full(len(POINTS), 1 / len(POINTS))
     second = SimpleNamespace(at=POINTS[::-1], inverse=2 * first.inverse, area=first.area)
-    tables = [SimpleNamespace(log_metric=one.by_cell[k, :, :, 0].numpy()) for k in range(2)]
+    tables = [SimpleNamespace(log_metric=one.bilinear[k, :, :, 0].numpy()) for k in range(2)]
     matrix, shift, number = np.eye(2)[None], np.zeros((1, 2)), np.zeros(1, dtype=int)
     both = Batch(
         [first, second],
