@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from torch import nn
 
+from nsm.tasks.quasi_newton import QuasiNewton
 from nsm.tasks.training import Training
 
 
@@ -24,3 +26,24 @@ class AtTriangles(Training):
     def __init__(self) -> None:
         super().__init__()
         self.quadrature, self.triangles_from = None, math.inf
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        optimizer = self.trainer.optimizers[0]
+        if isinstance(optimizer, QuasiNewton) and self.begins_at_triangles:
+            optimizer.begin_anew()
+
+    @property
+    def begins_at_triangles(self) -> bool:
+        """Whether the next step is the first at triangles."""
+        return self.global_step - 1 < self.triangles_from <= self.global_step
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the training has made its last step."""
+        return self.global_step >= self.trainer.max_steps
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        if self.is_over:  # no step goes on with what is known, which is large
+            for state in checkpoint["optimizer_states"]:
+                state.pop("known", None)

@@ -196,6 +196,10 @@ class ConstrainedMap(AtTriangles):
             if isinstance(optimizer, QuasiNewton) and optimizer.on_last_level:
                 self._stop_if_settled()
 
+    @property
+    def is_over(self) -> bool:
+        return super().is_over or bool(self.settled)
+
     def _stop_if_settled(self) -> None:
         assert self.distortion is not None
         change = (self.reached / self.distortion - 1).abs()
@@ -214,7 +218,7 @@ class ConstrainedMap(AtTriangles):
         if not len(self.points) or self.ramp < 1:
             return
         with torch.no_grad():
-            if self.global_step - 1 < self.triangles_from <= self.global_step:
+            if self.begins_at_triangles:
                 self.lost |= ~self._near(self(self.points) - self.targets)
                 self.multipliers *= ~self.lost[..., None]
             if settings.landmarks != "augmented" or self.global_step < self.multipliers_from:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -54,28 +55,37 @@ class DeviceLevel:
         # by way of the host, once in a step on a coarse level
         return torch.from_numpy(self._level.restored(fine)).to(self.device)
 
-    def metric(self, smoothing: float, seen: Iterable[Seen]) -> DenseMetric:
+    @cached_property
+    def _places(self) -> Tensor:
+        """(nnz,) in a matrix (rows, rows), of the pattern's entries; they rise."""
+        pattern = self._level.pattern
+        row = np.repeat(np.arange(self.rows), np.diff(pattern.indptr))
+        return torch.from_numpy(row * self.rows + pattern.indices).to(self.device)
+
+    def entries(self, smoothing: float, seen: Iterable[Seen]) -> Tensor:
+        """As :meth:`nsm.tasks.spline_level.Level.entries`."""
+        regularizer = torch.from_numpy(self._level.regularizer(smoothing)).to(self.device)
+        entries = regularizer.repeat(self.out_dim, 1)
+        for x, blocks in seen:
+            rows, weights = self._level.grid.seen(x.double(), tangents=True)
+            pairs = (rows[:, :, None] * self.rows + rows[:, None]).flatten()
+            place = torch.searchsorted(self._places, pairs)
+            w = weights.transpose(0, 1)  # (N, 3, 9)
+            for own, block in zip(entries, blocks.double(), strict=True):
+                own.index_add_(0, place, (w.mT @ block @ w).flatten())
+        return entries
+
+    def metric(self, entries: Tensor) -> DenseMetric:
         """As :meth:`nsm.tasks.spline_level.Level.metric`.
 
         One matrix after the other is made and factorised: that of a spline of 128 × 128 cells
         takes 2.3 GB.
         """
-        pattern, n = self._level.pattern, self.rows
-        row = np.repeat(np.arange(n), np.diff(pattern.indptr))
-        place = torch.from_numpy(row * n + pattern.indices).to(self.device)
-        entries = torch.from_numpy(self._level.regularizer(smoothing)).to(self.device)
-        parts = []
-        for x, blocks in seen:
-            rows, weights = self._level.grid.seen(x.double(), tangents=True)
-            parts.append(((rows[:, :, None] * n + rows[:, None]).flatten(), weights, blocks))
         factors = []
-        for component in range(self.out_dim):
-            flat = torch.zeros(n * n, dtype=torch.float64, device=self.device)
-            flat[place] = entries
-            for pairs, weights, blocks in parts:
-                w = weights.transpose(0, 1)  # (N, 3, 9)
-                flat.index_add_(0, pairs, (w.mT @ blocks[component].double() @ w).flatten())
-            factors.append(_factor(flat.view(n, n)))
+        for own in entries:
+            flat = own.new_zeros(self.rows**2)
+            flat[self._places] = own
+            factors.append(_factor(flat.view(self.rows, self.rows)))
         return DenseMetric(factors)
 
 

@@ -7,7 +7,7 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsm.maps import SplineField
@@ -15,20 +15,16 @@ from nsm.stages import at as shown
 from nsm.stages import part
 from nsm.tasks.curvature import Curvature
 from nsm.tasks.device_level import DeviceLevel
+from nsm.tasks.limited_memory import LimitedMemory, Vector
 from nsm.tasks.spline_level import Level
 
 _SUFFICIENT = 1e-4  # Armijo's condition
 _TRIALS = 14
 _HALVED = 3  # trials at most by half; then a triangle folds within a short way
-_FLAT = 1e-10  # pairs of less curvature say nothing
-# largest change of a coefficient in the first iteration of a step without known curvature
-_FIRST = 0.02
 # relative gain of a step on the last level, below which the next ones gain nothing
 _CONVERGED = 1e-4
-
-
-# of double precision: an array of numpy for the CPU, a tensor on any other device
-_Vector = Any
+# relative gain of a step, below which the next one goes on with what is known of the curvature
+_NEAR = 0.1
 
 
 class _Found(NamedTuple):
@@ -36,7 +32,7 @@ class _Found(NamedTuple):
 
     loss: Any
     value: float
-    gradient: _Vector
+    gradient: Vector
 
 
 class QuasiNewton(Optimizer):
@@ -46,7 +42,8 @@ class QuasiNewton(Optimizer):
     at the present coefficients, each component of a spline apart, with a little H¹ added; its
     factors, sparse ones on the CPU, are the metric in which L-BFGS begins. K is near enough to the
     Hessian that few iterations follow, and they correct what it leaves out. Backtracking along each
-    direction ensures descent.
+    direction ensures descent. After a step on the last level that gained little, K and what the
+    iterations learned still hold, and the next step goes on with them.
 
     A level of n × n cells is a subspace of the finest grid by the two-scale relation of B-splines,
     so a finer level begins with the same function.
@@ -104,6 +101,8 @@ class QuasiNewton(Optimizer):
         self.state[self.fields[0].coefficients]["step"] = 0 if fresh else sum(steps)
         self._level: tuple[int, list[Level | DeviceLevel]] | None = None
         self._moving: list[tuple[SplineField, Level | DeviceLevel]] = []
+        self._known: LimitedMemory | None = None  # of the curvature, from the last step
+        self._stored: dict[str, Any] | None = None  # the same, as a checkpoint has it
 
     def watch(
         self,
@@ -117,6 +116,22 @@ class QuasiNewton(Optimizer):
             turns: gives what a step moves, one part after the other: modules with fields.
         """
         self.curvatures, self.turns = curvatures, turns
+
+    def begin_anew(self) -> None:
+        """Forget what is known of the curvature: the loss is another one from here on."""
+        self._known = self._stored = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """As torch's, with what is known of the curvature, so that it goes on as it would have."""
+        known = self._stored
+        if self._known is not None:
+            known = self._known.stored(self._moving[0][1].tensor)
+        return {**super().state_dict(), "known": known}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.begin_anew()
+        self._stored = state_dict.get("known")  # an earlier version's has none
 
     @property
     def on_last_level(self) -> bool:
@@ -163,27 +178,52 @@ class QuasiNewton(Optimizer):
             hardly &= before.value - after.value <= _CONVERGED * abs(before.value)
             loss = after.loss
         state["converged"] = number == len(self.counts) and hardly
+        if hardly:
+            self.begin_anew()
         return loss
 
-    def _now(self) -> _Vector:
+    def _now(self) -> Vector:
         """The present coefficients on the level, of what moves."""
         return self._joined([level.restored(field.coefficients) for field, level in self._moving])
 
     def _descended(self, closure: Callable[[], Any], found: _Found) -> _Found | None:
         """What is found after the iterations, from what is found at the present coefficients."""
-        at, known = self._now(), self.curvatures()
-        search = _Search(self.memory, self._metric(known), bool(known))
+        at, began, known = self._now(), found.value, self._taken()
+        if known is None:
+            curvatures = self.curvatures()
+            entries = self._entries(curvatures)
+            known = LimitedMemory(self.memory, entries, self._inverse(entries), bool(curvatures))
         for k in range(self.iterations):
             shown("iteration", k, self.iterations, f"loss {found.value:.2e}")
-            moved = self._searched(closure, search, at, found)
+            moved = self._searched(closure, known, at, found)
             if moved is None:
                 return None
             at, found, stuck = moved
-            if stuck and not search.forget():
-                break
+            if stuck and not known.forget():
+                return found
+        alone = len(self._moving) == len(self.fields)  # other parts change what this one minimizes
+        last = self._level is not None and self._level[0] == len(self.counts)
+        if alone and last and began - found.value < _NEAR * abs(found.value):
+            self._known = known
         return found
 
-    def _evaluated(self, closure: Callable[[], Any], at: _Vector) -> _Found | None:
+    def _taken(self) -> LimitedMemory | None:
+        """What is known of the curvature from the step before, which is no longer kept."""
+        known, stored = self._known, self._stored
+        self.begin_anew()
+        if stored is None:
+            return known
+        field, level = self._moving[0]
+
+        def vector(tensor: Tensor) -> Vector:
+            return level.vector(tensor.to(field.coefficients.device))
+
+        entries = [vector(each) for each in stored["entries"]]
+        found = LimitedMemory(self.memory, entries, self._inverse(entries), stored["known"])
+        found.restore(stored, vector)
+        return found
+
+    def _evaluated(self, closure: Callable[[], Any], at: Vector) -> _Found | None:
         """Loss and gradient at coefficients of the level; None if the step was rolled back."""
         self._put(at)
         with torch.enable_grad():
@@ -201,17 +241,17 @@ class QuasiNewton(Optimizer):
         return _Found(loss, float(value), self._joined(parts))
 
     def _searched(
-        self, closure: Callable[[], Any], search: _Search, at: _Vector, found: _Found
-    ) -> tuple[_Vector, _Found, bool] | None:
+        self, closure: Callable[[], Any], known: LimitedMemory, at: Vector, found: _Found
+    ) -> tuple[Vector, _Found, bool] | None:
         """One iteration: the coefficients and what is found there, and whether no step serves."""
-        d = -search.direction(found.gradient)
-        slope, length = float(found.gradient @ d), search.first(d, self.first_length)
+        d = -known.direction(found.gradient)
+        slope, length = float(found.gradient @ d), known.first(d, self.first_length)
         for trial in range(_TRIALS if slope < 0 else 0):
             new = self._evaluated(closure, at + length * d)
             if new is None:
                 return None
             if new.value <= found.value + _SUFFICIENT * length * slope:
-                search.learn(length * d, new.gradient - found.gradient)
+                known.learn(length, d, new.gradient - found.gradient)
                 return at + length * d, new, False
             excess = new.value - found.value - length * slope  # of the parabola through both ends
             least = -slope * length**2 / (2 * excess) if excess > 0 else 0.5 * length
@@ -219,21 +259,26 @@ class QuasiNewton(Optimizer):
         self._put(at)
         return at, found, True
 
-    def _metric(self, known: Sequence[Curvature]) -> Callable[[_Vector], _Vector]:
-        """The inverse of K on the level, at the present coefficients."""
+    def _entries(self, known: Sequence[Curvature]) -> list[Vector]:
+        """Those of K on the level, at the present coefficients, of each field that moves."""
         seen: dict[int, list[Any]] = {id(field): [] for field, _ in self._moving}
         for curvature in known:
             field, x, blocks = curvature.of_field()
             seen[id(field)].append((x, blocks))
-        metrics = [level.metric(self.smoothing, seen[id(f)]) for f, level in self._moving]
+        return [level.entries(self.smoothing, seen[id(field)]) for field, level in self._moving]
 
-        def solve(g: _Vector) -> _Vector:
+    def _inverse(self, entries: Sequence[Vector]) -> Callable[[Vector], Vector]:
+        """The inverse of K, given by its entries."""
+        every = zip(self._moving, entries, strict=True)
+        metrics = [level.metric(of_field) for (_, level), of_field in every]
+
+        def solve(g: Vector) -> Vector:
             parts = zip(metrics, self._split(g), strict=True)
             return self._joined([metric.solve(part) for metric, part in parts])
 
         return solve
 
-    def _split(self, flat: _Vector) -> list[_Vector]:
+    def _split(self, flat: Vector) -> list[Vector]:
         """A vector of the coefficients on the level of what moves, by field, each (rows, d)."""
         parts, end = [], 0
         for _, level in self._moving:
@@ -241,11 +286,11 @@ class QuasiNewton(Optimizer):
             parts.append(flat[start:end].reshape(-1, level.out_dim))
         return parts
 
-    def _joined(self, parts: list[_Vector]) -> _Vector:
+    def _joined(self, parts: list[Vector]) -> Vector:
         """The inverse of :meth:`_split`."""
         return self._moving[0][1].joined(parts)
 
-    def _put(self, at: _Vector) -> None:
+    def _put(self, at: Vector) -> None:
         for (field, level), c in zip(self._moving, self._split(at), strict=True):
             field.coefficients.copy_(level.tensor(level.up @ c))
 
@@ -254,43 +299,3 @@ def level_of(field: SplineField, cells: int) -> Level | DeviceLevel:
     """A level of a field, for the device where the field is."""
     level, device = Level(field, cells), field.coefficients.device
     return level if device.type == "cpu" else DeviceLevel(level, device)
-
-
-class _Search:
-    """The two-loop recursion (Nocedal and Wright, Algorithm 7.4) from the inverse of a metric."""
-
-    def __init__(self, memory: int, solve: Callable[[_Vector], _Vector], known: bool) -> None:
-        self.memory, self.solve, self.known = memory, solve, known
-        self.pairs: list[tuple[_Vector, _Vector, Any]] = []  # s, y and their product
-        self.scale: Any = 1.0
-
-    def direction(self, g: _Vector) -> _Vector:
-        """The inverse of the approximate Hessian times a gradient."""
-        q, shares = 1.0 * g, []  # a copy
-        for s, y, product in reversed(self.pairs):
-            shares.append((s @ q) / product)
-            q -= shares[-1] * y
-        d = self.scale * self.solve(q)
-        for s, y, product in self.pairs:
-            d += (shares.pop() - (y @ d) / product) * s
-        return d
-
-    def first(self, d: _Vector, lr: float) -> float:
-        """The first length to be tried along a direction."""
-        if self.known or self.pairs:
-            return lr
-        return min(lr, _FIRST / max(float(abs(d).max()), 1e-30))
-
-    def learn(self, s: _Vector, y: _Vector) -> None:
-        """Take a step and the change of the gradient."""
-        product = s @ y
-        if product > _FLAT * ((s @ s) * (y @ y)) ** 0.5:
-            if not self.pairs:
-                self.scale = product / (y @ self.solve(y))
-            self.pairs = [*self.pairs, (s, y, product)][-self.memory :]
-
-    def forget(self) -> bool:
-        """Begin again from the metric; False if nothing was learned."""
-        learned = bool(self.pairs)
-        self.pairs = []
-        return learned

@@ -147,8 +147,9 @@ class Level:
         normal = splu((self.down @ self.up).tocsc())
         return np.asarray(normal.solve(self.down @ given))
 
-    def metric(self, smoothing: float, seen: Iterable[Seen]) -> Metric:
-        """The metric of a step: what points see, and the :meth:`regularizer`.
+    def entries(self, smoothing: float, seen: Iterable[Seen]) -> np.ndarray:
+        """Of the matrices of a step, (d, nnz) in the pattern, one for each component: what points
+        see, and the :meth:`regularizer`.
 
         Args:
             smoothing: weight of the smoothness.
@@ -157,6 +158,10 @@ class Level:
         entries = np.tile(self.regularizer(smoothing), (self.out_dim, 1))
         for x, blocks in seen:
             entries += self.matrices(x, blocks)
+        return entries
+
+    def metric(self, entries: np.ndarray) -> Metric:
+        """The metric of matrices given by their entries (d, nnz)."""
         return Metric(self, entries)
 
     def matrices(self, x: Tensor, blocks: Tensor) -> np.ndarray:

@@ -74,3 +74,21 @@ def test_a_settled_map_takes_no_step_more_when_it_is_resumed(tmp_path):
             mapped(folder)
         steps, resumed = mapped(folder, resuming=True)
         assert steps == 18 and torch.equal(resumed, whole)
+
+
+def test_a_checkpoint_has_what_the_next_step_goes_on_with_and_the_last_one_not(tmp_path):
+    words = ["constraints.settled=0", "data.steps_per_epoch=1"]
+    _, whole = mapped(tmp_path / "whole", words=words)
+    folder = tmp_path / "interrupted"
+    with interrupted(at=19):
+        mapped(folder, words=words)
+    assert known(folder)
+    _, resumed = mapped(folder, resuming=True, words=words)
+    assert torch.equal(resumed, whole)
+    assert not known(folder)
+
+
+def known(folder):
+    """What the checkpoint of a folder knows of the loss's curvature."""
+    [state] = torch.load(folder / "last.ckpt", weights_only=True)["optimizer_states"]
+    return state.get("known")

@@ -228,8 +228,10 @@ def test_a_level_on_a_device_has_the_matrices_of_one_on_the_cpu(periodic, odd, c
     )
     half = torch.randn(2, 100, 3, 3).double()
     seen = [(2 * torch.rand(100, 2) - 1, half @ half.mT)]
-    expected = here.metric(0.1, seen).solve(c.numpy())
-    np.testing.assert_allclose(there.metric(0.1, seen).solve(c).numpy(), expected, rtol=1e-9)
+    expected, entries = here.entries(0.1, seen), there.entries(0.1, seen)
+    np.testing.assert_allclose(entries.numpy(), expected, rtol=1e-9, atol=1e-12)
+    solved = here.metric(expected).solve(c.numpy())
+    np.testing.assert_allclose(there.metric(entries).solve(c).numpy(), solved, rtol=1e-9)
 
 
 def test_a_matrix_that_is_not_positive_definite_has_a_factor():

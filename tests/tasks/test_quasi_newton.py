@@ -278,6 +278,69 @@ def test_known_curvature_reaches_a_quadratic_minimum_at_once():
     assert float(optimizer.step(closure)) < 1e-3 * first
 
 
+def wave(iterations):
+    """Steps, each of some iterations, to a map whose curvature is known, with little to gain."""
+    h = PlanarMap(SplineField(2, 8))
+    optimizer = QuasiNewton(
+        [h.network.coefficients], [h.network], [8], [], iterations=iterations, smoothing=0.0
+    )
+    x = points(400).float()
+    wanted = x + 0.2 * torch.sin(3 * x.flip(1))
+    # not the curvature, so that the iterations have something to learn
+    known = torch.eye(2).expand(400, 2, 2) * (8 / 400) * (1.5 + x[:, :1, None])
+    seen = []
+    optimizer.watch(lambda: seen.append(1) or [Curvature(h, x, known)], lambda: [h])
+
+    def step():
+        def closure():
+            optimizer.zero_grad()
+            loss = 1 + ((h(x) - wanted) ** 2).sum(dim=1).mean()
+            loss.backward()
+            return loss.detach()
+
+        return float(optimizer.step(closure))
+
+    return h, optimizer, step, seen
+
+
+def test_steps_of_little_gain_go_on_as_one_longer_step():
+    whole, _, step, seen = wave(6)
+    step()
+    parts, _, short, looked = wave(2)
+    for _ in range(3):
+        short()
+    # a step begins with coefficients in single precision
+    torch.testing.assert_close(
+        parts.network.coefficients, whole.network.coefficients, rtol=1e-3, atol=1e-6
+    )
+    assert len(seen) == len(looked) == 1
+
+
+def test_a_step_begins_anew_when_told_to():
+    h, optimizer, step, seen = wave(2)
+    step()
+    assert optimizer.state_dict()["known"] is not None
+    optimizer.begin_anew()
+    assert optimizer.state_dict()["known"] is None
+    step()
+    assert len(seen) == 2
+
+
+def test_what_is_known_of_the_curvature_is_stored():
+    whole, optimizer, step, _ = wave(2)
+    step()
+    kept = copy.deepcopy((whole.state_dict(), optimizer.state_dict()))
+    resumed, other, again, seen = wave(2)
+    resumed.load_state_dict(kept[0])
+    other.load_state_dict(kept[1])
+    assert other.state_dict()["known"] is kept[1]["known"]  # until a step takes it
+    for _ in range(2):
+        step()
+        again()
+    assert torch.equal(resumed.network.coefficients, whole.network.coefficients)
+    assert not seen
+
+
 def test_a_step_that_was_rolled_back_ends():
     f = SplineField(2, 8)
     optimizer = build_optimizer(f, SETTINGS)
