@@ -29,8 +29,13 @@ class AtTriangles(Training):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         optimizer = self.trainer.optimizers[0]
-        if isinstance(optimizer, QuasiNewton) and self.begins_at_triangles:
+        if isinstance(optimizer, QuasiNewton) and self.loss_changes:
             optimizer.begin_anew()
+
+    @property
+    def loss_changes(self) -> bool:
+        """Whether the next step has a loss of another curvature than the one before."""
+        return self.begins_at_triangles
 
     @property
     def begins_at_triangles(self) -> bool:

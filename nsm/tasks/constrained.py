@@ -125,6 +125,10 @@ class ConstrainedMap(AtTriangles):
         return min(1.0, self.global_step / self.ramp_steps) if self.ramp_steps else 1.0
 
     @property
+    def loss_changes(self) -> bool:
+        return super().loss_changes or self.global_step - 1 < self.ramp_steps
+
+    @property
     def landmark_weight(self) -> float:
         """λ_C, as far as it has risen on the ramp; more at triangles."""
         raised = self.constraints.ramp_of == "weights"

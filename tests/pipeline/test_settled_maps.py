@@ -11,7 +11,7 @@ from tiny import results
 
 from nsm.config import compose_config
 from nsm.pipeline import Given, run_task
-from nsm.tasks import CollectionMap, PairMap, constrained
+from nsm.tasks import CollectionMap, PairMap, constrained, quasi_newton
 
 WORDS = ["data.batch_size=64", "data.held_out=64", "data.steps_per_epoch=4", "logger=none"]
 WORDS += ["trainer.max_steps=20", "trainer.threads=1", "trainer.progress=false", "artefacts=false"]
@@ -22,6 +22,7 @@ WORDS += ["constraints.settled=1e9"]
 @cache
 def surfaces():
     """Two domes and their surfaces by random networks, the same in all trainings."""
+    torch.manual_seed(0)
     return results(rings=3).neural
 
 
@@ -76,7 +77,10 @@ def test_a_settled_map_takes_no_step_more_when_it_is_resumed(tmp_path):
         assert steps == 18 and torch.equal(resumed, whole)
 
 
-def test_a_checkpoint_has_what_the_next_step_goes_on_with_and_the_last_one_not(tmp_path):
+def test_a_checkpoint_has_what_the_next_step_goes_on_with_and_the_last_one_not(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(quasi_newton, "_NEAR", 1e9)
     words = ["constraints.settled=0", "data.steps_per_epoch=1"]
     _, whole = mapped(tmp_path / "whole", words=words)
     folder = tmp_path / "interrupted"
@@ -92,3 +96,12 @@ def known(folder):
     """What the checkpoint of a folder knows of the loss's curvature."""
     [state] = torch.load(folder / "last.ckpt", weights_only=True)["optimizer_states"]
     return state.get("known")
+
+
+@pytest.mark.parametrize("ramp, times", [(0.4, 1), (1.0, 4)])
+def test_a_step_goes_on_only_with_the_same_weights(ramp, times, tmp_path, monkeypatch):
+    monkeypatch.setattr(quasi_newton, "_NEAR", 1e9)
+    looked, curvatures = [], PairMap.curvatures
+    monkeypatch.setattr(PairMap, "curvatures", lambda self: looked.append(1) or curvatures(self))
+    mapped(tmp_path, words=["constraints.settled=0", f"constraints.ramp={ramp}"])
+    assert len(looked) == times  # of four quasi-Newton steps
