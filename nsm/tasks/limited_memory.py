@@ -8,7 +8,8 @@ from typing import Any
 from torch import Tensor
 
 _FLAT = 1e-10  # pairs of less curvature say nothing
-# times the length that served last: a longer one is not tried first
+# times the length that served last: a longer one is not tried first, once the iterations go on from
+# an earlier step
 _LONGER = 2.0
 # largest change of a coefficient in the first iteration of a step without known curvature
 _FIRST = 0.02
@@ -37,7 +38,8 @@ class LimitedMemory:
         self.memory, self.entries, self.solve, self.known = memory, entries, solve, known
         self.pairs: list[tuple[Vector, Vector, Any]] = []  # s, y and their product
         self.scale: Any = 1.0
-        self.length = float("inf")  # that served last
+        self.goes_on = False  # from an earlier step
+        self.length = float("inf")  # that served last, since then
 
     def direction(self, g: Vector) -> Vector:
         """The inverse of the approximate Hessian times a gradient."""
@@ -58,7 +60,7 @@ class LimitedMemory:
 
     def learn(self, length: float, d: Vector, y: Vector) -> None:
         """Take a step, by its length along a direction, and the change of the gradient."""
-        if self.known or self.pairs:
+        if self.goes_on:
             self.length = length
         s = length * d
         product = s @ y

@@ -209,10 +209,15 @@ class QuasiNewton(Optimizer):
 
     def _taken(self) -> LimitedMemory | None:
         """What is known of the curvature from the step before, which is no longer kept."""
-        known, stored = self._known, self._stored
+        found, stored = self._known, self._stored
         self.begin_anew()
-        if stored is None:
-            return known
+        if stored is not None:
+            found = self._restored(stored)
+        if found is not None:
+            found.goes_on = True
+        return found
+
+    def _restored(self, stored: dict[str, Any]) -> LimitedMemory:
         field, level = self._moving[0]
 
         def vector(tensor: Tensor) -> Vector:
