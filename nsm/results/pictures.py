@@ -17,7 +17,7 @@ from torch import nn
 from nsm.domains import Surface
 from nsm.energies import conformal, symmetric_dirichlet
 from nsm.results.evaluation import evaluate, evaluate_jacobian
-from nsm.results.files import atomic_write
+from nsm.results.files import PNG_LEVEL, atomic_write
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.metrics import vertex_error
 from nsm.results.render import Blend, View, vertex_normals
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from nsm.results.artifact import NeuralSurface
 
 PANEL = 640
-COMPRESSION = 4  # of PNG files: 6, the usual level, takes twice as long for files 4 % smaller
 # at least as many triangles show the shape of φ rather than that of the mesh
 _FINE_FACES = 30_000
 _VANISHING = 1e-3  # of the mean area element around a vertex: less has no direction
@@ -146,11 +145,9 @@ def parameterization_picture(
     The squares have one size everywhere, so that their images show area and angle distortion. The
     titles have the medians of D_iso (symmetric Dirichlet) and D_conf over the triangles.
     """
-    view = View(surface.vertices, PANEL)
-    above = [
-        (view.draw(surface.vertices, surface.faces, checked(uv), surface.seam_pairs), name)
-        for name, uv in maps.items()
-    ]
+    vertices, faces = surface.vertices, surface.faces
+    shape = View(vertices, PANEL).seen(vertices, faces, surface.seam_pairs)
+    above = [(shape.painted(checked(uv)), name) for name, uv in maps.items()]
     below = [(layout_image(surface, uv, size=PANEL), _medians(surface, uv)) for uv in maps.values()]
     save_figure(panels(above, below), path)
 
@@ -213,5 +210,5 @@ def panels(*rows: list[tuple[np.ndarray, str]], bar: bool = False) -> Any:
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG (see :func:`atomic_write`)."""
     data = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(data, pil_kwargs={"compress_level": COMPRESSION})
+    FigureCanvasAgg(figure).print_png(data, pil_kwargs={"compress_level": PNG_LEVEL})
     atomic_write(path, data.getvalue())
