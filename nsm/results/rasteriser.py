@@ -86,9 +86,9 @@ def _plane(xy: np.ndarray, corners: np.ndarray, size: int, plane: np.ndarray) ->
     area = up * right - left * down
     plane[2, 0], plane[2, 1] = down / area, -right / area
     plane[3, 0], plane[3, 1] = up / area, -left / area
-    for axis in range(2):
-        plane[1, axis] = -plane[2, axis] - plane[3, axis]
-    return bool(np.isfinite(plane).all())
+    # not finite where one of the others is not
+    plane[1, 0], plane[1, 1] = -plane[2, 0] - plane[3, 0], -plane[2, 1] - plane[3, 1]
+    return bool(np.isfinite(plane[1, 0]) and np.isfinite(plane[1, 1]))
 
 
 @compiled
@@ -170,7 +170,7 @@ def _draw(
             for column in range(first, end):
                 u, v, w = _coordinates(plane, column, row)
                 if u >= 0 and v >= 0 and w >= 0:
-                    near, at = u * a + v * b + w * c, row * size + column
+                    near, at = u * a + w * c + v * b, row * size + column
                     if near >= nearest[at]:
                         nearest[at], face_at[at] = near, f
 
