@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from nsm.results.render import covering, rasterise
+from nsm.results.rasteriser import covering, rasterise
 from nsm.surfaces.location import locate
 from nsm.surfaces.textures import Texture
 from nsm.surfaces.topology import face_areas

@@ -12,7 +12,7 @@ import pytorch_lightning as pl
 from PIL import Image
 from pytorch_lightning.callbacks import Callback
 
-from nsm.results.files import atomic_write
+from nsm.results.files import PNG_LEVEL, atomic_write
 from nsm.tasks.ensemble import members
 
 STRIP_FILE = "evolution.png"
@@ -84,5 +84,5 @@ def extend_strip(file: Path, picture: np.ndarray, place: int) -> None:
         with Image.open(file) as image:
             row.insert(0, np.asarray(image.convert("RGB"))[:, : place * width])
     data = io.BytesIO()
-    Image.fromarray(np.concatenate(row, axis=1)).save(data, format="PNG")
+    Image.fromarray(np.concatenate(row, axis=1)).save(data, format="PNG", compress_level=PNG_LEVEL)
     atomic_write(file, data.getvalue())

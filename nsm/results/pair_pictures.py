@@ -14,16 +14,23 @@ from PIL import Image
 from nsm.domains import Surface
 from nsm.energies import symmetric_dirichlet
 from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
-from nsm.results.files import atomic_write
+from nsm.results.files import PNG_LEVEL, atomic_write
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.meshes import by_position
-from nsm.results.pictures import PANEL, by_normals, checked, panels, save_figure, vertex_means
+from nsm.results.pictures import (
+    PANEL,
+    by_normals,
+    checked,
+    panels,
+    save_figure,
+    vertex_means,
+)
 from nsm.results.render import Blend, View, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.results.surface_map import SurfaceMap
 from nsm.results.textures import GREY
 
-_STRIP, _GIF = 300, 300
+_MORPH = 300  # pixels, the side of a picture of the morph
 _LEAST, WORST = LEAST_SYMMETRIC_DIRICHLET, 20.0  # ends of the colour scale
 _TICKS = [_LEAST, 5, 7, 10, 20]
 _SCALE = ScalarMappable(LogNorm(_LEAST, WORST), "viridis")
@@ -42,13 +49,15 @@ def transfer_picture(path: str | Path, f: SurfaceMap) -> None:
     board = np.where(f.unreached[:, None], np.nan, f.source_uv)
     left, right = View(s.vertices, PANEL), View(target, PANEL, frame=View(s.vertices, 8).frame)
 
-    def at_source(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        spheres = Spheres(s.vertices, s.faces, s.cut_vertex[f.landmarks[:, 0]])
-        return left.draw(*spheres.mesh, spheres.painted(paint), s.seam_pairs)
+    def drawn(
+        view: View, vertices: np.ndarray, surface: Surface, column: int
+    ) -> Callable[[Callable[[Blend], np.ndarray]], np.ndarray]:
+        at = surface.cut_vertex[f.landmarks[:, column]]
+        spheres = Spheres(vertices, surface.faces, at)
+        shape = view.seen(*spheres.mesh, surface.seam_pairs)
+        return lambda paint: shape.painted(spheres.painted(paint))
 
-    def at_target(paint: Callable[[Blend], np.ndarray]) -> np.ndarray:
-        spheres = Spheres(target, t.faces, t.cut_vertex[f.landmarks[:, 1]])
-        return right.draw(*spheres.mesh, spheres.painted(paint), t.seam_pairs)
+    at_source, at_target = drawn(left, s.vertices, s, 0), drawn(right, target, t, 1)
 
     rows = [
         [
@@ -155,19 +164,20 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
     s = f.source.surface
     start, end = s.vertices, f.aligned_image
     both = np.concatenate([start, end])
-    frame = View(s.vertices, 8).frame
+    view = View(both, _MORPH, frame=View(s.vertices, 8).frame)
 
-    def draw(t: float, size: int) -> np.ndarray:
-        view = View(both, size, frame=frame)
+    def draw(t: float) -> np.ndarray:
         points = (1 - t) * start + t * end
         picture = view.draw(points, s.faces, checked(s.uv), s.seam_pairs)
         return np.round(255 * picture).astype(np.uint8)
 
-    row = np.concatenate([draw(t, _STRIP) for t in np.linspace(0, 1, 5)], axis=1)
+    drawn = [draw(t) for t in np.linspace(0, 1, 9)]
+    row = np.concatenate(drawn[::2], axis=1)
     data = io.BytesIO()
-    Image.fromarray(row).save(data, format="PNG")
+    Image.fromarray(row).save(data, format="PNG", compress_level=PNG_LEVEL)
     atomic_write(strip, data.getvalue())
-    frames = [Image.fromarray(draw(t, _GIF)) for t in np.linspace(0, 1, 9)]
+    # with their palettes, which each frame otherwise gets whenever it is shown
+    frames = [Image.fromarray(d).convert("P", palette=Image.Palette.ADAPTIVE) for d in drawn]
     frames += frames[-2:0:-1]
     data = io.BytesIO()
     frames[0].save(

@@ -17,7 +17,7 @@ from torch import nn
 from nsm.domains import Surface
 from nsm.energies import conformal, symmetric_dirichlet
 from nsm.results.evaluation import evaluate, evaluate_jacobian
-from nsm.results.files import atomic_write
+from nsm.results.files import PNG_LEVEL, atomic_write
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.metrics import vertex_error
 from nsm.results.render import Blend, View, vertex_normals
@@ -39,14 +39,13 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     error = vertex_error(surface, neural.map)
     scale = ScalarMappable(Normalize(0, max(float(np.percentile(error, 99)), 1e-6)), "viridis")
     view = View(surface.vertices, PANEL)
-    source = view.draw(surface.vertices, surface.faces, _grey, surface.seam_pairs)
+    shapes = [
+        view.seen(x, surface.faces, surface.seam_pairs)
+        for x in (surface.vertices, evaluate(neural.map, surface.uv))
+    ]
+    source = shapes[0].painted(_grey)
     colours = scale.to_rgba(error)[:, :3]
-    image = view.draw(
-        evaluate(neural.map, surface.uv),
-        surface.faces,
-        lambda blend: blend(colours),
-        surface.seam_pairs,
-    )
+    image = shapes[1].painted(lambda blend: blend(colours))
     rms = neural.metrics.get("rms_percent")
     title = "neural surface" + (f", RMS {rms:.3f} % of the diagonal" if rms is not None else "")
     off = neural.metrics.get("normal_error_mean_degrees")
@@ -56,12 +55,10 @@ def error_picture(path: str | Path, surface: Surface, neural: NeuralSurface) -> 
     ]
     below = [
         (
-            view.draw(x, surface.faces, by_normals(normal), surface.seam_pairs),
+            shape.painted(by_normals(normal)),
             "normals" + (f", mean error {off:.2f}°" if k and off is not None else ""),
         )
-        for k, (x, normal) in enumerate(
-            zip((surface.vertices, evaluate(neural.map, surface.uv)), normals, strict=True)
-        )
+        for k, (shape, normal) in enumerate(zip(shapes, normals, strict=True))
     ]
     figure = panels([(source, f"{surface.name}: mesh"), (image, title)], below, bar=True)
     figure.colorbar(
@@ -148,11 +145,9 @@ def parameterization_picture(
     The squares have one size everywhere, so that their images show area and angle distortion. The
     titles have the medians of D_iso (symmetric Dirichlet) and D_conf over the triangles.
     """
-    view = View(surface.vertices, PANEL)
-    above = [
-        (view.draw(surface.vertices, surface.faces, checked(uv), surface.seam_pairs), name)
-        for name, uv in maps.items()
-    ]
+    vertices, faces = surface.vertices, surface.faces
+    shape = View(vertices, PANEL).seen(vertices, faces, surface.seam_pairs)
+    above = [(shape.painted(checked(uv)), name) for name, uv in maps.items()]
     below = [(layout_image(surface, uv, size=PANEL), _medians(surface, uv)) for uv in maps.values()]
     save_figure(panels(above, below), path)
 
@@ -200,7 +195,7 @@ def panels(*rows: list[tuple[np.ndarray, str]], bar: bool = False) -> Any:
     for k, (image, title) in enumerate(panel for row in rows for panel in row):
         axes = figure.add_subplot(len(rows), columns, k + 1)
         axes.imshow(image, interpolation="antialiased")
-        axes.set_title(title)
+        axes.set_title(title, y=1.0)  # where it is by default, which takes long to find out
         axes.set_axis_off()
     edges = {
         "left": 0.01,
@@ -215,5 +210,5 @@ def panels(*rows: list[tuple[np.ndarray, str]], bar: bool = False) -> Any:
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG (see :func:`atomic_write`)."""
     data = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(data)
+    FigureCanvasAgg(figure).print_png(data, pil_kwargs={"compress_level": PNG_LEVEL})
     atomic_write(path, data.getvalue())

@@ -128,7 +128,7 @@ def reliability_picture(path: str | Path, f: SurfaceMap) -> None:
     colours = _colours(f.reliability)
     # a point inserted between vertices takes the colour of one of them
     row = np.maximum(s.source_vertex, 0)
-    view = View(s.vertices, PANEL)
+    shape = View(s.vertices, PANEL).seen(s.vertices, s.faces, s.seam_pairs)
     titles = (
         f"symmetric Dirichlet, {_BEST:.0f} (dark) to {_WORST:.0f} (bright)",
         "smallest stretch, red where flipped",
@@ -137,7 +137,7 @@ def reliability_picture(path: str | Path, f: SurfaceMap) -> None:
     drawn = []
     for of_vertices, title in zip(colours, titles, strict=True):
         paint = _painted(of_vertices[row])
-        drawn.append((view.draw(s.vertices, s.faces, paint, s.seam_pairs), title))
+        drawn.append((shape.painted(paint), title))
     save_figure(panels(drawn), path)
 
 

@@ -1,4 +1,4 @@
-"""A small exact rasteriser: pictures of meshes without a window or a driver.
+"""Shaded pictures of meshes without a window or a driver.
 
 Drawing libraries need OpenGL, which servers often lack, or take seconds to draw triangle by
 triangle and sort them wrongly; a picture during training may take a fraction of a second.
@@ -15,12 +15,14 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from nsm.compiled import compiled
+from nsm.results.rasteriser import interpolated, rasterise
+
 Blend = Callable[[np.ndarray], np.ndarray]
 
 _SUPERSAMPLING = 2
-_CHUNK = 4_000_000  # pixels in the boxes around the triangles of one pass
-_SLACK = 1e-9  # of a barycentric coordinate: rounding leaves no pixel out
 _LIGHT = np.array([-0.35, 0.55, 0.75]) / np.linalg.norm([-0.35, 0.55, 0.75])
+_BETWEEN = (_LIGHT + [0, 0, 1]) / 1.87  # the light and the viewer: where highlights are
 
 
 # rotations of each axis to y, the upward axis of a view
@@ -74,99 +76,6 @@ def view_frame(vertices: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(towards, right), towards])
 
 
-def rasterise(
-    xy: np.ndarray, depth: np.ndarray, faces: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nearest face at each pixel of a square picture.
-
-    Args:
-        xy: (V, 2) vertices in pixels, y downwards.
-        depth: (V,), larger is nearer.
-        faces: (F, 3).
-        size: side of the picture in pixels.
-
-    Returns:
-        pixels (P,) flat indices of those covered, their face (P,) and its barycentric
-        coordinates (P, 3).
-    """
-    pixel, face, weights = covering(xy, faces, size)
-    near = np.einsum("pk,pk->p", weights, depth[faces[face]])
-    nearest = np.full(size * size, -np.inf)
-    np.fmax.at(nearest, pixel, near)
-    of_pixel = np.full(size * size, -1)
-    seen = np.flatnonzero(near == nearest[pixel])
-    of_pixel[pixel[seen]] = seen  # of several at one depth the last
-    chosen = of_pixel[of_pixel >= 0]
-    return pixel[chosen], face[chosen], weights[chosen]
-
-
-def covering(
-    xy: np.ndarray, faces: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every face at each pixel of a square picture: as :func:`rasterise`, with a row for each pair
-    of a pixel and a face that contains its centre."""
-    corners = xy[faces]
-    # skip triangles that are not finite or far larger than the picture
-    visible = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < 4 * size).all(axis=(1, 2))
-    kept = np.flatnonzero(visible)
-    low = np.clip(np.floor(corners[kept].min(axis=1)), 0, size).astype(np.int64)
-    high = np.clip(np.ceil(corners[kept].max(axis=1)), 0, size).astype(np.int64)
-    part = np.cumsum((high - low).prod(axis=1)) // _CHUNK
-    starts = np.flatnonzero(np.diff(part, prepend=-1))
-    hits = []
-    for some in np.split(np.arange(len(kept)), starts[1:]):
-        face = kept[some]
-        hits.append(_covered(corners[face], low[some], high[some], size, face))
-    pixel, face, weights = (np.concatenate(parts) for parts in zip(*hits, strict=True))
-    return pixel, face, weights
-
-
-def _covered(
-    corners: np.ndarray, low: np.ndarray, high: np.ndarray, size: int, face: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """What triangles (F, 3, 2) cover of the pixels from ``low`` to before ``high`` (F, 2).
-
-    Along a row each barycentric coordinate is slope · x + offset, so that only the pixels between
-    the roots are looked at.
-    """
-    a, b, c = (corners[:, k] for k in range(3))
-    area = _cross(b - a, c - a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the gradients of w1 and w2; not finite for triangles seen edge-on, which cover nothing
-        slope1, slope2 = (
-            np.stack([e[:, 1], -e[:, 0]], axis=1) / area[:, None] for e in (c - a, a - b)
-        )
-        slopes = np.stack([-slope1 - slope2, slope1, slope2])
-    covers = np.isfinite(slopes).all(axis=(0, 2))
-    row, of = _ranges(low[:, 1], np.where(covers, high[:, 1], low[:, 1]))
-    slopes = slopes[:, of]
-    first, last = low[of, 0].astype(float), high[of, 0] - 1.0
-    y = row + 0.5 - a[of, 1]
-    for k in range(3):
-        slope, offset = slopes[k, :, 0], (k == 0) + slopes[k, :, 1] * y
-        with np.errstate(divide="ignore", invalid="ignore"):
-            root = a[of, 0] - (offset + _SLACK) / slope - 0.5
-        np.copyto(first, np.ceil(root), where=(slope > 0) & (root > first))
-        np.copyto(last, np.floor(root), where=(slope < 0) & (root < last))
-    column, line = _ranges(first.astype(np.int64), last.astype(np.int64) + 1)
-    x, y, of = column + 0.5 - a[of[line], 0], y[line], of[line]
-    w1, w2 = (slope[of, 0] * x + slope[of, 1] * y for slope in (slope1, slope2))
-    weights = np.stack([1 - w1 - w2, w1, w2], axis=1)
-    inside = (weights >= 0).all(axis=1)
-    return (row[line] * size + column)[inside], face[of[inside]], weights[inside]
-
-
-def _ranges(first: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The whole numbers of each range [first, end), in turn, and which range each is of."""
-    count = np.maximum(end - first, 0)
-    of = np.repeat(np.arange(len(count)), count)
-    return np.arange(len(of)) - (np.cumsum(count) - count - first)[of], of
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 class View:
     """A fixed camera on a reference mesh, so that pictures can be compared side by side.
 
@@ -201,30 +110,121 @@ class View:
         """A shaded picture (size, size, 3) in [0, 1] on white.
 
         Args:
+            vertices, faces, seam_pairs: as for :meth:`seen`.
+            colours: as for :meth:`Seen.painted`.
+        """
+        return self.seen(vertices, faces, seam_pairs).painted(colours)
+
+    def seen(
+        self, vertices: np.ndarray, faces: np.ndarray, seam_pairs: np.ndarray | None = None
+    ) -> Seen:
+        """A mesh as it is seen, to be painted once or more.
+
+        Args:
             vertices, faces: the mesh (V, 3), (F, 3).
-            colours: gives the colours (P, 3) in [0, 1] of the pixels, from a function that
-                interpolates vertex values (V, k) to them, (P, k).
             seam_pairs: (T, 2) vertices that were one before the cut, which share a normal.
         """
-        fine = self.size * _SUPERSAMPLING
         xy, depth = self.pixels(vertices)
-        pixel, face, weights = rasterise(xy * _SUPERSAMPLING, depth, faces, fine)
-        corners = faces[face]
+        found = rasterise(xy * _SUPERSAMPLING, depth, faces, self.size * _SUPERSAMPLING)
+        return Seen(
+            self.size, faces, *found, vertex_normals(vertices @ self.frame.T, faces, seam_pairs)
+        )
 
-        def blend(values: np.ndarray) -> np.ndarray:
-            return np.einsum("pk,pkd->pd", weights, values[corners])
 
-        base = colours(blend)
-        normal = blend(vertex_normals(vertices @ self.frame.T, faces, seam_pairs))
-        normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
-        facing = np.where(normal[:, 2:] < 0, -normal, normal)
-        lit = 0.38 + 0.62 * np.clip(facing @ _LIGHT, 0, 1)
-        shine = 0.12 * np.clip(facing @ (_LIGHT + [0, 0, 1]) / 1.87, 0, 1) ** 24
-        picture = np.ones((fine * fine, 3))
-        picture[pixel] = np.clip(base * lit[:, None] + shine[:, None], 0, 1)
-        parts = picture.reshape(self.size, _SUPERSAMPLING, self.size, _SUPERSAMPLING, 3)
-        finer = np.ndindex(_SUPERSAMPLING, _SUPERSAMPLING)
-        return np.mean([parts[:, i, :, j] for i, j in finer], axis=0)
+class Seen:
+    """What a view shows of a mesh, and how it is lit.
+
+    Args:
+        size: side of the picture in pixels.
+        faces: (F, 3).
+        pixel, face, weights: of the finer picture that pixels are the means of, as
+            :func:`nsm.results.rasteriser.rasterise` gives them.
+        normals: (V, 3), the third coordinate towards the viewer.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        faces: np.ndarray,
+        pixel: np.ndarray,
+        face: np.ndarray,
+        weights: np.ndarray,
+        normals: np.ndarray,
+    ) -> None:
+        self._size, self._pixel = size, pixel
+        self._corners, self._weights = faces[face], weights
+        self._lit, self._shine = np.empty(len(pixel)), np.empty(len(pixel))
+        _light(self._blend(normals), _LIGHT, _BETWEEN, self._lit, self._shine)
+
+    def painted(self, colours: Callable[[Blend], np.ndarray]) -> np.ndarray:
+        """A shaded picture (size, size, 3) in [0, 1] on white.
+
+        Args:
+            colours: gives the colours (P, 3) in [0, 1] of the pixels, from a function that
+                interpolates vertex values (V, k) to them, (P, k).
+        """
+        of_pixels = np.empty((len(self._pixel), 3))
+        of_pixels[:] = colours(self._blend)  # perhaps one for all
+        fine = self._size * _SUPERSAMPLING
+        row = np.full(fine * fine, -1)
+        row[self._pixel] = np.arange(len(self._pixel))
+        picture = np.empty((self._size, self._size, 3))
+        _compose(
+            row.reshape(fine, fine), of_pixels, self._lit, self._shine, _SUPERSAMPLING, picture
+        )
+        return picture
+
+    def _blend(self, values: np.ndarray) -> np.ndarray:
+        return interpolated(values, self._corners, self._weights)
+
+
+@compiled
+def _light(
+    normals: np.ndarray,
+    light: np.ndarray,
+    between: np.ndarray,
+    lit: np.ndarray,
+    shine: np.ndarray,
+) -> None:
+    """Write how brightly surfaces of these normals (P, 3), of any length and to either side, show
+    their colours (P,), and the white of highlights (P,)."""
+    for p in range(len(normals)):
+        x, y, z = normals[p, 0], normals[p, 1], normals[p, 2]
+        length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+        if z < 0:
+            length = -length
+        x, y, z = x / length, y / length, z / length
+        facing = x * light[0] + y * light[1] + z * light[2]
+        lit[p] = 0.38 + 0.62 * min(max(facing, 0.0), 1.0)
+        facing = x * between[0] + y * between[1] + z * between[2]
+        shine[p] = 0.12 * min(max(facing, 0.0), 1.0) ** 24
+
+
+@compiled
+def _compose(
+    row: np.ndarray,
+    colours: np.ndarray,
+    lit: np.ndarray,
+    shine: np.ndarray,
+    finer: int,
+    picture: np.ndarray,
+) -> None:
+    """Write a picture (S, S, 3): each pixel is the mean of ``finer`` ones a side, which are white
+    or, where ``row`` is not negative, of that row of the colours (P, 3)."""
+    size = len(picture)
+    for y in range(size):
+        for x in range(size):
+            for channel in range(3):
+                total = 0.0
+                for i in range(finer):
+                    for j in range(finer):
+                        p = row[y * finer + i, x * finer + j]
+                        if p < 0:
+                            total += 1
+                        else:
+                            shown = colours[p, channel] * lit[p] + shine[p]
+                            total += min(max(shown, 0.0), 1.0)
+                picture[y, x, channel] = total / finer**2
 
 
 def vertex_normals(

@@ -49,6 +49,10 @@ class Spheres:
                 return blend(filled)
 
             own = blend(self._colours)
-            return np.where(own[:, 3:] > 0.5, own[:, :3], paint(of_mesh))
+            shown = np.empty((len(own), 3))
+            shown[:] = paint(of_mesh)
+            on_sphere = own[:, 3] > 0.5
+            shown[on_sphere] = own[on_sphere, :3]
+            return shown
 
         return colours

@@ -174,9 +174,11 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def equal_faces(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of (G, 3) and of (F, 3) with the same three numbers, none negative: pairs (M,), (M,)."""
-    rows = np.sort(np.concatenate([there, here]), axis=1)
-    _, number = np.unique(rows, axis=0, return_inverse=True)
-    number = number.reshape(-1)
+    rows = np.sort(np.concatenate([there, here]), axis=1).astype(np.int64)
+    # by numbers of rows, which are sorted sooner than rows; those with a negative are not used
+    span = rows.max(initial=0) + 1
+    pair = np.unique(rows[:, 0] * span + rows[:, 1], return_inverse=True)[1]
+    number = np.unique(pair * span + rows[:, 2], return_inverse=True)[1]
     usable = np.asarray((rows >= 0).all(axis=1))
     first = np.full(number.max() + 1, -1)
     mine = np.flatnonzero(usable[: len(there)])[::-1]  # the first of equal faces is taken

@@ -56,7 +56,7 @@ def made(tmp_path_factory):
     piece = SCALE * points + [5.0, 0.0, -3.0]
     pairs = [[v, int(number[v])] for v in marks]
     with pytest.MonkeyPatch.context() as patch:  # large pictures take most of the time
-        for name in ("pair_pictures.PANEL", "pair_pictures._STRIP", "pair_pictures._GIF"):
+        for name in ("pair_pictures.PANEL", "pair_pictures._MORPH"):
             patch.setattr(f"nsm.results.{name}", 96)
         patch.setattr("nsm.results.reliability.PANEL", 96)
         ends = (piece, faces), whole, pairs

@@ -16,7 +16,8 @@ from nsm.maps import NeuralMap
 from nsm.results import NeuralSurface, SurfaceMap
 from nsm.results.baking import atlas_fault, baked, charts, padded, rim_texels, texels
 from nsm.results.file_faces import FileFaces
-from nsm.results.render import View, rasterise
+from nsm.results.rasteriser import rasterise
+from nsm.results.render import View
 from nsm.results.textured_mesh import FileMesh, TexturedMesh, painted
 from nsm.surfaces.atlas import unwrapped
 from nsm.surfaces.geometry import point_mesh_distance, triangle_distortion

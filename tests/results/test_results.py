@@ -42,7 +42,8 @@ from nsm.results.files import as_json
 from nsm.results.landmark_picture import landmarks_picture
 from nsm.results.pair_pictures import normals_picture
 from nsm.results.pictures import neural_normals, normals_at_vertices
-from nsm.results.render import UP_AXES, View, rasterise, vertex_normals
+from nsm.results.rasteriser import rasterise
+from nsm.results.render import UP_AXES, View, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.surfaces.shapes import ring_mesh
 

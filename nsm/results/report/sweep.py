@@ -151,9 +151,10 @@ def _overfit(folder: Path, trust: Sequence[str]) -> _Panels:
     said = (
         f"RMS {metrics['rms_percent']:.3g} %, normals {metrics['normal_error_mean_degrees']:.3g}°"
     )
+    shape = view.seen(vertices, faces)
     return [
-        (view.draw(vertices, faces, grey), f"neural surface: {said}"),
-        (view.draw(vertices, faces, lambda blend: blend(normals)), "colours of its normals"),
+        (shape.painted(grey), f"neural surface: {said}"),
+        (shape.painted(lambda blend: blend(normals)), "colours of its normals"),
         (view.draw(surface.vertices, surface.faces, grey, surface.seam_pairs), "mesh"),
     ]
 
