@@ -121,6 +121,11 @@ class QuasiNewton(Optimizer):
         """Forget what is known of the curvature: the loss is another one from here on."""
         self._known = self._stored = None
 
+    def release(self) -> None:
+        """Let go of the matrices, which are large; a further step makes them again."""
+        self.begin_anew()
+        self._level, self._moving = None, []
+
     def state_dict(self) -> dict[str, Any]:
         """As torch's, with what is known of the curvature, so that it goes on as it would have."""
         known = self._stored

@@ -80,6 +80,11 @@ class Training(Microbatching):
             self.log_figures(self.figures)
         self.figures = None
 
+    def on_train_end(self) -> None:
+        for optimizer in self.trainer.optimizers:
+            if isinstance(optimizer, QuasiNewton):
+                optimizer.release()
+
     def log_figures(self, figures: Mapping[str, Any], batch_size: int | None = None) -> None:
         """Log figures under their names; means over batches weigh each by its size."""
         self.log_dict(dict(figures), batch_size=batch_size)

@@ -326,6 +326,18 @@ def test_a_step_begins_anew_when_told_to():
     assert len(seen) == 2
 
 
+def test_what_is_released_is_made_again():
+    ends = []
+    for let_go in (QuasiNewton.begin_anew, QuasiNewton.release):
+        h, optimizer, step, seen = wave(2)
+        step()
+        let_go(optimizer)
+        step()
+        assert len(seen) == 2
+        ends.append(h.network.coefficients)
+    assert torch.equal(*ends)
+
+
 def test_what_is_known_of_the_curvature_is_stored():
     whole, optimizer, step, _ = wave(2)
     step()
