@@ -24,6 +24,9 @@ _LAST = 10.0
 # more than any value that is reached, and finite as all of a checkpoint
 _NEVER = torch.finfo(torch.float32).max
 _MET = 0.02  # in percent of the target's diagonal: landmarks that are nearer are met
+# of the flipped triangles: while a step leaves less than this share, the next one is worth its time.
+# Where fewer turn back, the repair does it
+_OPENED = 0.5
 # in units of Ω: where there is a seam, a landmark that is farther off once λ_C is in full lies on
 # the other side of it; more force only folds the map
 _LOST = 0.1
@@ -45,8 +48,8 @@ class ConstrainedMap(AtTriangles):
     a one is let go: it is missed, which figures tell, and the others are met without folds.
 
     Quasi-Newton steps at triangles end where a step changes the distortion by less than
-    ``constraints.settled``, all landmarks are met, and no fewer triangles are flipped than before
-    it: maps of like shapes take few.
+    ``constraints.settled``, all landmarks are met, and more than half as many triangles are flipped
+    as before it: maps of like shapes take few.
 
     Subclasses set ``map``, call ``set_landmarks``, keep the distortion of each evaluation in
     ``distortion``, and define ``flipped_percent`` and ``landmark_error``.
@@ -210,7 +213,7 @@ class ConstrainedMap(AtTriangles):
         with torch.no_grad():
             missed = len(self.points) > 0 and bool((self.landmark_error()[self.held] > _MET).any())
             flipped = self.flipped_percent()
-        opening = bool(flipped < self.flipped)
+        opening = bool(flipped < _OPENED * self.flipped)
         self.reached, self.flipped = self.distortion.to(self.reached), flipped
         if change < self.constraints.settled and not missed and not opening:
             self.settled.fill_(True)

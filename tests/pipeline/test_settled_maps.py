@@ -62,9 +62,12 @@ def test_a_map_goes_on_while_it_misses_landmarks(tmp_path, monkeypatch):
 
 
 def test_a_map_goes_on_while_its_folds_open(tmp_path, monkeypatch):
+    steps = count()
+    monkeypatch.setattr(PairMap, "flipped_percent", lambda self: torch.tensor(3.0 ** -next(steps)))
+    assert mapped(tmp_path / "fast")[0] == 20
     left = count(10, -1)
     monkeypatch.setattr(PairMap, "flipped_percent", lambda self: torch.tensor(float(next(left))))
-    assert mapped(tmp_path)[0] == 20
+    assert mapped(tmp_path / "slowly")[0] == 18
 
 
 def test_a_settled_map_takes_no_step_more_when_it_is_resumed(tmp_path):
