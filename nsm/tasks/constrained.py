@@ -24,7 +24,7 @@ _LAST = 10.0
 # more than any value that is reached, and finite as all of a checkpoint
 _NEVER = torch.finfo(torch.float32).max
 _MET = 0.02  # in percent of the target's diagonal: landmarks that are nearer are met
-# of the flipped triangles: while a step leaves less than this share, the next one is worth its time.
+# share of the flipped triangles: while a step leaves less of them, the next one is worth its time.
 # Where fewer turn back, the repair does it
 _OPENED = 0.5
 # in units of Ω: where there is a seam, a landmark that is farther off once λ_C is in full lies on
