@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import pytorch_lightning as pl
 from PIL import Image
 from pytorch_lightning.callbacks import Callback
 
-from nsm.results.files import PNG_LEVEL, atomic_write
+from nsm.results.files import write_png
 from nsm.tasks.ensemble import members
 
 STRIP_FILE = "evolution.png"
@@ -83,6 +82,4 @@ def extend_strip(file: Path, picture: np.ndarray, place: int) -> None:
     if place and file.exists():
         with Image.open(file) as image:
             row.insert(0, np.asarray(image.convert("RGB"))[:, : place * width])
-    data = io.BytesIO()
-    Image.fromarray(np.concatenate(row, axis=1)).save(data, format="PNG", compress_level=PNG_LEVEL)
-    atomic_write(file, data.getvalue())
+    write_png(file, Image.fromarray(np.concatenate(row, axis=1)))

@@ -7,6 +7,7 @@ figures, and the checksum of the first). There is no pickle: loading runs no cod
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -16,7 +17,7 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load, save
@@ -24,6 +25,9 @@ from torch import Tensor
 
 from nsm.errors import NotRegistered, NotTrusted, NsmError
 from nsm.results.old_versions import from_version_1
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 VERSION = 2
 PNG_LEVEL = 4  # of zlib: 6, the usual one, takes nearly twice as long for files 2 to 8 % smaller
@@ -68,6 +72,13 @@ def atomic_write(path: str | Path, data: bytes) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+def write_png(path: str | Path, image: Image) -> None:
+    """Write an image of PIL as PNG (see :func:`atomic_write`)."""
+    data = io.BytesIO()
+    image.save(data, format="PNG", compress_level=PNG_LEVEL)
+    atomic_write(path, data.getvalue())
 
 
 def flush_folder(folder: Path) -> None:

@@ -14,17 +14,10 @@ from PIL import Image
 from nsm.domains import Surface
 from nsm.energies import symmetric_dirichlet
 from nsm.energies.distortion import LEAST_SYMMETRIC_DIRICHLET
-from nsm.results.files import PNG_LEVEL, atomic_write
+from nsm.results.files import atomic_write, write_png
 from nsm.results.map_metrics import triangle_metric
 from nsm.results.meshes import by_position
-from nsm.results.pictures import (
-    PANEL,
-    by_normals,
-    checked,
-    panels,
-    save_figure,
-    vertex_means,
-)
+from nsm.results.pictures import PANEL, by_normals, checked, panels, save_figure, vertex_means
 from nsm.results.render import Blend, View, vertex_normals
 from nsm.results.spheres import Spheres
 from nsm.results.surface_map import SurfaceMap
@@ -172,10 +165,7 @@ def morph_pictures(strip: str | Path, animation: str | Path, f: SurfaceMap) -> N
         return np.round(255 * picture).astype(np.uint8)
 
     drawn = [draw(t) for t in np.linspace(0, 1, 9)]
-    row = np.concatenate(drawn[::2], axis=1)
-    data = io.BytesIO()
-    Image.fromarray(row).save(data, format="PNG", compress_level=PNG_LEVEL)
-    atomic_write(strip, data.getvalue())
+    write_png(strip, Image.fromarray(np.concatenate(drawn[::2], axis=1)))
     # with their palettes, which each frame otherwise gets whenever it is shown
     frames = [Image.fromarray(d).convert("P", palette=Image.Palette.ADAPTIVE) for d in drawn]
     frames += frames[-2:0:-1]

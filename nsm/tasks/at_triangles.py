@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import nn
 
-from nsm.tasks.quasi_newton import QuasiNewton
 from nsm.tasks.training import Training
 
 
@@ -28,9 +27,8 @@ class AtTriangles(Training):
         self.quadrature, self.triangles_from = None, math.inf
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        optimizer = self.trainer.optimizers[0]
-        if isinstance(optimizer, QuasiNewton) and self.loss_changes:
-            optimizer.begin_anew()
+        if self.quasi_newton is not None and self.loss_changes:
+            self.quasi_newton.begin_anew()
 
     @property
     def loss_changes(self) -> bool:

@@ -12,7 +12,6 @@ from nsm.settings import PairConstraints, PairWeights
 from nsm.tasks.at_triangles import AtTriangles
 from nsm.tasks.curvature import Curvature
 from nsm.tasks.fold_barrier import further_training, stronger
-from nsm.tasks.quasi_newton import QuasiNewton
 from nsm.tasks.terms import Distortion, Evaluation, HeldOut, as_blend, made_terms
 
 # float32 places a point of the boundary no better than this
@@ -198,10 +197,8 @@ class ConstrainedMap(AtTriangles):
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
         self._hold_landmarks()
-        if self.global_step > self.triangles_from:
-            optimizer = self.trainer.optimizers[0]
-            if isinstance(optimizer, QuasiNewton) and optimizer.on_last_level:
-                self._stop_if_settled()
+        if self.global_step > self.triangles_from and self.may_end_early:
+            self._stop_if_settled()
 
     @property
     def is_over(self) -> bool:

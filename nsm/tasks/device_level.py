@@ -57,10 +57,7 @@ class DeviceLevel:
 
     @cached_property
     def _places(self) -> Tensor:
-        """(nnz,) in a matrix (rows, rows), of the pattern's entries; they rise."""
-        pattern = self._level.pattern
-        row = np.repeat(np.arange(self.rows), np.diff(pattern.indptr))
-        return torch.from_numpy(row * self.rows + pattern.indices).to(self.device)
+        return torch.from_numpy(self._level.places).to(self.device)
 
     def entries(self, smoothing: float, seen: Iterable[Seen]) -> Tensor:
         """As :meth:`nsm.tasks.spline_level.Level.entries`."""

@@ -145,7 +145,7 @@ class Param(OneMeshMap):
 
     def _stop_if_converged(self) -> None:
         # the loss is the same in each step, unlike that of maps with multipliers
-        if getattr(self.trainer.optimizers[0], "converged", False):
+        if self.quasi_newton is not None and self.quasi_newton.converged:
             self.trainer.should_stop = True
 
     def strengthen(self, steps: int) -> None:

@@ -144,6 +144,11 @@ class QuasiNewton(Optimizer):
         return bool(self.state[self.fields[0].coefficients]["step"] >= sum(self.counts))
 
     @property
+    def _at_last_level(self) -> bool:
+        """Whether the step that is made is on the last level."""
+        return self._level is not None and self._level[0] == len(self.counts)
+
+    @property
     def converged(self) -> bool:
         """Whether the last step was one of the last level and hardly changed the loss."""
         return bool(self.state[self.fields[0].coefficients].get("converged", False))
@@ -182,8 +187,8 @@ class QuasiNewton(Optimizer):
                 return None
             hardly &= before.value - after.value <= _CONVERGED * abs(before.value)
             loss = after.loss
-        state["converged"] = number == len(self.counts) and hardly
-        if hardly:
+        state["converged"] = self._at_last_level and hardly
+        if self.converged:
             self.begin_anew()
         return loss
 
@@ -207,8 +212,7 @@ class QuasiNewton(Optimizer):
             if stuck and not known.forget():
                 return found
         alone = len(self._moving) == len(self.fields)  # other parts change what this one minimizes
-        last = self._level is not None and self._level[0] == len(self.counts)
-        if alone and last and began - found.value < _NEAR * abs(found.value):
+        if alone and self._at_last_level and began - found.value < _NEAR * abs(found.value):
             self._known = known
         return found
 

@@ -123,14 +123,18 @@ class Level:
         return first, place
 
     @cached_property
+    def places(self) -> np.ndarray:
+        """Those of the pattern's entries (nnz,) in a matrix (rows, rows); they rise."""
+        row = np.repeat(np.arange(self.rows), np.diff(self.pattern.indptr))
+        return np.asarray(row * self.rows + self.pattern.indices)
+
+    @cached_property
     def _entries(self) -> tuple[np.ndarray, np.ndarray]:
         """Those of the floor and of the smoothness, (nnz,) each, in the pattern."""
-        row = np.repeat(np.arange(self.rows), np.diff(self.pattern.indptr))
-        key = row * self.rows + self.pattern.indices  # rises
-        floor, smooth = np.zeros(len(key)), np.zeros(len(key))
+        floor, smooth = np.zeros(self.pattern.nnz), np.zeros(self.pattern.nnz)
         for entries, matrix in ((floor, self.floor.tocoo()), (smooth, self.smoothness.tocoo())):
-            place = np.searchsorted(key, matrix.row.astype(np.int64) * self.rows + matrix.col)
-            entries[place] = matrix.data
+            wanted = matrix.row.astype(np.int64) * self.rows + matrix.col
+            entries[np.searchsorted(self.places, wanted)] = matrix.data
         return floor, smooth
 
     def regularizer(self, smoothing: float) -> np.ndarray:

@@ -42,8 +42,13 @@ class Training(Microbatching):
     @property
     def may_end_early(self) -> bool:
         """Whether the steps to come end where they no longer gain much."""
+        return self.quasi_newton is not None and self.quasi_newton.on_last_level
+
+    @property
+    def quasi_newton(self) -> QuasiNewton | None:
+        """The optimizer, if it is one of quasi-Newton steps."""
         optimizer = self.trainer.optimizers[0]
-        return isinstance(optimizer, QuasiNewton) and optimizer.on_last_level
+        return optimizer if isinstance(optimizer, QuasiNewton) else None
 
     def pointwise(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor
@@ -81,9 +86,8 @@ class Training(Microbatching):
         self.figures = None
 
     def on_train_end(self) -> None:
-        for optimizer in self.trainer.optimizers:
-            if isinstance(optimizer, QuasiNewton):
-                optimizer.release()
+        if self.quasi_newton is not None:
+            self.quasi_newton.release()
 
     def log_figures(self, figures: Mapping[str, Any], batch_size: int | None = None) -> None:
         """Log figures under their names; means over batches weigh each by its size."""
